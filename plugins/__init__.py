@@ -1,0 +1,29 @@
+"""Registers the integrator plugins with Mitsuba, again after every variant switch. Nothing else lives here.
+
+Mitsuba keeps Python plugins per variant and forgets them on `mi.set_variant`; its variant callback lets us
+register them anew. On Mitsuba 3.10 the entry-point group `mitsuba` imports this module as well.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import mitsuba as mi
+
+_PLUGINS = ("psdr_path",)
+
+
+def _register(_old: str | None, variant: str | None) -> None:
+    if variant is None or "_ad_" not in variant:
+        return  # no derivatives in this variant, hence nothing to register
+    for name in ("_render", *_PLUGINS):
+        full = f"{__name__}.{name}"
+        if full in sys.modules:
+            importlib.reload(sys.modules[full])  # the base class belongs to the new variant
+        else:
+            importlib.import_module(full)
+
+
+mi.detail.add_variant_callback(_register)
+_register(None, mi.variant())

@@ -1,0 +1,41 @@
+"""psdr_jit: path-space differentiable rendering as Mitsuba 3 integrator plugins.
+
+Symbols of the papers, and what they are called in the code (`_d`: attached to the AD graph):
+
+    x_B            point on an edge                                   EdgePoint.x
+    x_D, x_S       ends of a boundary segment, sensor and source side x_d, x_s
+    ω, τ, n_⊥      segment direction, edge tangent, normal across     view.ω, τ, EdgePoint.side
+    v, u           material velocity, velocity of the path's flow     derivative of an attached point
+    f, G, L_e      BSDF · cosine, geometry term, emitted radiance     f, measure, value
+    β, η           path throughput, accumulated relative IOR          β, η
+    δL, λ          adjoint radiance, adjoint of a ray's origin        δL, λ_o
+
+Data flows one way: scene → scene_analysis → edge sets and distributions → interior | boundary terms → film → image.
+"""
+
+from __future__ import annotations
+
+__version__ = "0.1.0"
+
+from .llvm import apply_saved_choice as _apply_saved_choice
+
+_apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
+
+try:
+    from . import plugins as plugins  # registers the integrators, now and after every variant switch
+except ModuleNotFoundError as error:  # `psdr doctor` must be able to say so
+    if error.name not in ("mitsuba", "drjit"):
+        raise
+else:
+    from .check import CheckResult, check_gradient
+    from .gradient import GradientResult, gradient
+    from .params import ParamInfo, differentiable_params
+
+    __all__ = [
+        "CheckResult",
+        "GradientResult",
+        "ParamInfo",
+        "check_gradient",
+        "differentiable_params",
+        "gradient",
+    ]

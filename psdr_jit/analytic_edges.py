@@ -1,0 +1,135 @@
+"""Edges of shapes without triangles: the rim of a disk, the rims and silhouette of a cylinder, that of a sphere.
+
+In the local space of Mitsuba's plugins (unit disk in z = 0, unit cylinder z ∈ [0, 1], unit sphere) each is a curve
+x(s), s ∈ [0, 1). Tangency is preserved by affine maps, so a silhouette may be found locally: x with n·(c − x) = 0,
+where the viewpoint c is a point, or a direction for parallel projection [do Carmo 1976, §2-4 on contours].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import drjit as dr
+import mitsuba as mi
+
+#: Each curve is cut into this many pieces, so that hidden or distant parts get their own weight.
+PIECES = 64
+
+
+class Curve(IntEnum):
+    DISK_RIM = 0
+    CYLINDER_BOTTOM = 1
+    CYLINDER_TOP = 2
+    CYLINDER_LEFT = 3  # the two silhouette lines
+    CYLINDER_RIGHT = 4
+    SPHERE_SILHOUETTE = 5
+
+
+CURVES_OF = {
+    "disk": (Curve.DISK_RIM,),
+    "cylinder": (Curve.CYLINDER_BOTTOM, Curve.CYLINDER_TOP, Curve.CYLINDER_LEFT, Curve.CYLINDER_RIGHT),
+    "sphere": (Curve.SPHERE_SILHOUETTE,),
+}
+
+
+@dataclass
+class CurveRows:
+    """One entry per piece of a curve; detached device arrays."""
+
+    kind: mi.UInt32  # Curve
+    shape: mi.UInt32  # index into the curve set's shapes
+    start: mi.Float  # s at the start of the piece; every piece is 1 / PIECES long
+
+
+@dataclass(frozen=True)
+class CurveSet:
+    """Curves of disks, cylinders and spheres. `rows` is None when there are none."""
+
+    shapes: tuple[mi.Shape, ...]
+    rows: CurveRows | None
+
+
+@dataclass
+class CurvePoint:
+    """A point on a curve, local space, for one viewpoint. Detached."""
+
+    x: mi.Point3f
+    dx_ds: mi.Vector3f
+    outward: mi.Vector3f  # a local direction that leads away from the shape
+    valid: mi.Bool  # the silhouette exists (the viewpoint is outside)
+
+
+def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
+    """Curves of `(shape, plugin name)` pairs."""
+    kind, owner, start = [], [], []
+    for i, (_, plugin) in enumerate(shapes):
+        for curve in CURVES_OF[plugin]:
+            kind += [int(curve)] * PIECES
+            owner += [i] * PIECES
+            start += [piece / PIECES for piece in range(PIECES)]
+    if not kind:
+        return CurveSet((), None)
+    rows = CurveRows(mi.UInt32(kind), mi.UInt32(owner), mi.Float(start))
+    return CurveSet(tuple(shape for shape, _ in shapes), rows)
+
+
+def attached_to_world(shapes: tuple[mi.Shape, ...], index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
+    """Columns (x, y, z axis, origin) of each lane's object-to-world map, attached to the shapes' `to_world`."""
+    matrices = [mi.traverse(shape)["to_world"].matrix for shape in shapes]
+
+    def column(j: int) -> mi.Vector3f:
+        entries = (dr.concat([mi.Float(m[i, j]) for m in matrices]) for i in range(3))
+        return mi.Vector3f(*(dr.gather(mi.Float, entry, index) for entry in entries))
+
+    return tuple(column(j) for j in range(4))
+
+
+def transform_point(columns: tuple[mi.Vector3f, ...], x: mi.Point3f) -> mi.Point3f:
+    return mi.Point3f(columns[0] * x.x + columns[1] * x.y + columns[2] * x.z + columns[3])
+
+
+def transform_vector(columns: tuple[mi.Vector3f, ...], x: mi.Vector3f) -> mi.Vector3f:
+    return columns[0] * x.x + columns[1] * x.y + columns[2] * x.z
+
+
+def local_viewpoint(columns: tuple[mi.Vector3f, ...], view: mi.Vector4f) -> mi.Vector4f:
+    """Homogeneous viewpoint in local space: Cramer's rule on the columns (w stays as it is)."""
+    a, b, c, o = columns
+    v = mi.Vector3f(view.x, view.y, view.z) - view.w * o
+    inv_det = dr.rcp(dr.dot(a, dr.cross(b, c)))
+    x, y, z = dr.dot(v, dr.cross(b, c)), dr.dot(v, dr.cross(c, a)), dr.dot(v, dr.cross(a, b))
+    return mi.Vector4f(x * inv_det, y * inv_det, z * inv_det, view.w)
+
+
+def curve_point(kind: mi.UInt32, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
+    """Evaluate curve `kind` at parameter `s` for the local viewpoint `view`. Detached, branch-free."""
+    sin, cos = dr.sincos(dr.two_pi * s)
+    rim_z = dr.select(kind == int(Curve.CYLINDER_TOP), 1.0, 0.0)
+    x = mi.Point3f(cos, sin, rim_z)
+    dx = dr.two_pi * mi.Vector3f(-sin, cos, 0)
+    outward = mi.Vector3f(cos, sin, 0)
+    valid = mi.Bool(True)
+
+    left, right = kind == int(Curve.CYLINDER_LEFT), kind == int(Curve.CYLINDER_RIGHT)
+    line = left | right
+    rho = dr.norm(mi.Vector2f(view.x, view.y))
+    φ = dr.atan2(view.y, view.x) + dr.select(left, 1.0, -1.0) * dr.acos(dr.clip(view.w / rho, -1, 1))
+    sin, cos = dr.sincos(φ)
+    x[line], dx[line], outward[line] = mi.Point3f(cos, sin, s), mi.Vector3f(0, 0, 1), mi.Vector3f(cos, sin, 0)
+    valid &= ~line | (rho > view.w)
+
+    ball = kind == int(Curve.SPHERE_SILHOUETTE)
+    axis = mi.Vector3f(view.x, view.y, view.z)
+    distance = dr.norm(axis)
+    axis /= distance
+    height = view.w / distance
+    radius = dr.safe_sqrt(1 - dr.square(height))
+    a, b = mi.coordinate_system(axis)
+    sin, cos = dr.sincos(dr.two_pi * s)
+    on_circle = cos * a + sin * b
+    point = mi.Point3f(height * axis + radius * on_circle)
+    x[ball], outward[ball] = point, mi.Vector3f(point)
+    dx[ball] = dr.two_pi * radius * (cos * b - sin * a)
+    valid &= ~ball | (distance > view.w)
+    return CurvePoint(x, dx, outward, valid)

@@ -1,0 +1,145 @@
+"""From a row of the edge tables to a point seen by the sensor: position, tangent, and the two sides of the edge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..analytic_edges import (
+    PIECES,
+    CurveSet,
+    attached_to_world,
+    curve_point,
+    local_viewpoint,
+    transform_point,
+    transform_vector,
+)
+from ..edge_set import EdgeSet, attached_positions, face_uv
+from ..sensor_frame import SensorFrame, View, look_at, towards_viewer, viewpoint
+
+#: Sideways distance at which a ray that passes a straight edge is traced, relative to the coordinates: far above
+#: the rounding of float32 positions (1e-7), far below anything one can see.
+SIDE_OFFSET = 1e-5
+
+#: The side rays start this many side offsets in front of the edge: an edge that rests on another surface is then
+#: seen against that surface, and the ray does not start beneath it.
+LEAD = 100.0
+
+#: The same for curved surfaces, as a fraction of the curve's own scale: a ray just inside a tangent point must start
+#: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
+CURVE_LEAD = 0.02
+
+#: Share of the distance to the edge that the visibility ray leaves out.
+VISIBILITY_EPSILON = 1e-4
+
+
+@dataclass
+class EdgePoint:
+    """A point on an edge as the sensor sees it through one lens point; detached, one entry per sample."""
+
+    x: mi.Point3f  # [m]
+    view: View
+    side: mi.Vector3f  # unit, perpendicular to ω and to the edge: across the edge
+    speed: mi.Float  # length of edge seen per unit of its parameter, |dx/ds × ω| [m]
+    valid: mi.Bool
+
+
+@dataclass
+class Side:
+    """What lies on one side of an edge: a face of its own, or whatever the ray meets."""
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    traced: mi.Bool  # `pi` is still to be found by tracing `ray`
+
+
+def _across(dx: mi.Vector3f, ω: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+    side = dr.cross(dx, ω)
+    length = dr.norm(side)
+    return dr.select(length > 0, side / length, 0), length
+
+
+def segment_point(edges: EdgeSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active) -> EdgePoint:
+    """Point at parameter `t` of a straight edge."""
+    p0 = dr.gather(mi.Point3f, edges.rows.p0, row, active)
+    dx = dr.gather(mi.Point3f, edges.rows.p1, row, active) - p0
+    x = p0 + t * dx
+    view = look_at(frame, x, aperture)
+    side, speed = _across(mi.Vector3f(dx), view.ω)
+    return EdgePoint(x, view, side, speed, active & view.valid & (speed > 0))
+
+
+def segment_motion(edges: EdgeSet, row, t, active) -> mi.Point3f:
+    """The same point attached to the vertices of its mesh."""
+    positions = attached_positions(edges.meshes)
+    v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (edges.rows.v0, edges.rows.v1))
+    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(mi.Point3f, positions, v1, active)
+
+
+def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, active) -> tuple[Side, mi.Bool]:
+    """One side of a straight edge: `which` = 0 towards −`point.side`, 1 towards +`point.side`.
+
+    Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than any
+    offset. With b_i the direction into face i, face i lies on side sign(b_i · side); two faces on the same side
+    are a silhouette, of which the one nearer to the viewer is seen. Also returns whether the two sides can differ.
+    """
+    rows = dr.gather(type(edges.rows), edges.rows, row, active)
+    τ = dr.normalize(rows.p1 - rows.p0)
+    ω = point.view.ω
+    into0, into1 = dr.cross(rows.n0, τ), dr.cross(τ, rows.n1)
+    a0, a1 = dr.dot(into0, point.side), dr.dot(into1, point.side)
+    silhouette = ~rows.border & (a0 * a1 > 0)
+    nearer1 = silhouette & (dr.dot(into1, ω) * dr.abs(a0) < dr.dot(into0, ω) * dr.abs(a1))
+
+    towards = dr.select(which == 0, -1.0, 1.0)
+    on0, on1 = a0 * towards > 0, ~rows.border & (a1 * towards > 0)
+    use1 = on1 & (~on0 | nearer1)
+    own = on0 | on1
+    uv = dr.select(use1, face_uv(rows.corner1, t), face_uv(rows.corner0, t))
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    pi.valid = own & active
+    pi.t = dr.select(pi.valid, point.view.r, dr.inf)
+    pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
+    pi.prim_uv = uv
+    pi.shape = dr.gather(mi.ShapePtr, edges.shapes, dr.select(use1, rows.shape1, rows.shape0), active & own)
+
+    offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + dr.norm(rows.p1 - rows.p0))
+    beside = point.x + towards * offset * point.side - LEAD * offset * ω
+    ray = mi.Ray3f(dr.select(own, point.view.o, beside), ω)
+    return Side(ray, pi, ~own), rows.border | silhouette | rows.seam
+
+
+def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active):
+    """Point at parameter `t` of a piece of an analytic curve: `(EdgePoint, local point, outward, scale)`."""
+    rows = dr.gather(type(curves.rows), curves.rows, row, active)
+    columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, rows.shape))
+    local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture)))
+    x = transform_point(columns, local.x)
+    view = look_at(frame, x, aperture)
+    side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, view.ω)
+    outward = transform_vector(columns, local.outward)
+    scale = dr.norm(outward)
+    side *= dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)  # + is away from the shape
+    valid = active & view.valid & local.valid & (speed > 0)
+    return EdgePoint(x, view, side, speed, valid), local.x, scale
+
+
+def curve_motion(curves: CurveSet, row, local: mi.Point3f, active) -> mi.Point3f:
+    """The material point at `local`, attached to its shape's pose: a contour moves with n·v of the surface."""
+    shape = dr.gather(mi.UInt32, curves.rows.shape, row, active)
+    return transform_point(attached_to_world(curves.shapes, shape), dr.detach(local))
+
+
+def curve_sides(point: EdgePoint, scale: mi.Float, which: mi.UInt32) -> Side:
+    """Rays just inside (`which` = 0) and outside (1) of a curve."""
+    offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + scale)
+    towards = dr.select(which == 0, -1.0, 1.0)
+    ray = mi.Ray3f(point.x + towards * offset * point.side - CURVE_LEAD * scale * point.view.ω, point.view.ω)
+    return Side(ray, dr.zeros(mi.PreliminaryIntersection3f), mi.Bool(True))
+
+
+def facing(n: mi.Normal3f, x: mi.Point3f, view: mi.Vector4f) -> mi.Float:
+    """> 0 where a face with normal `n` through `x` turns to the viewpoint (not normalised)."""
+    return dr.dot(n, towards_viewer(view, x))

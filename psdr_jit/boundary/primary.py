@@ -1,0 +1,223 @@
+"""Primary boundary: discontinuities that the sensor sees directly, integrated over the film.
+
+The film image is cut by the projections of edges. Moving edges sweep the film; with x_B on an edge, ω the direction
+from the sensor to it and s = τ×ω/|τ×ω| the direction across the edge, the derivative of the image receives
+
+    (L_− − L_+) · s·(v_B − u) · |dx/dt × ω| / J_px / pdf(t)         splatted at the projection of x_B,
+
+L_∓ radiance on the side −s and +s, v_B the material velocity of the edge point, u that of the point at x_B's depth
+on the viewing ray of a *fixed* film position (camera motion), and J_px the area perpendicular to ω that one pixel sees
+there. It is [Zhang et al. 2020, Eq. 21] restricted to the first segment, or the edge integral of [Li et al. 2018, Eq. 5],
+written in world space: only x_B and the camera ray are attached, so pose, field of view, principal point,
+aperture and focus need no code of their own.
+
+The value of the estimator is 0, only its derivative is not. Both sides are traced with the same random numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .. import film as films
+from ..analytic_edges import CurveSet, curve_set
+from ..edge_distribution import EdgeDistribution, edge_distribution, pmf, sample_edge, stratified
+from ..edge_set import EdgeSet, edge_set
+from ..job import Job
+from ..path_steps import NoSink, skip_emitters, walk
+from ..sensor_frame import SensorFrame, sensor_frame
+from ..streams import Stream, lane_sampler, stream_seed
+from . import film_weights
+from .edge_points import (
+    VISIBILITY_EPSILON,
+    EdgePoint,
+    curve_motion,
+    curve_row_point,
+    curve_sides,
+    segment_motion,
+    segment_point,
+    segment_sides,
+)
+
+
+@dataclass(frozen=True)
+class PrimaryEdges:
+    """What can be seen to move, and the density with which it is sampled. Straight rows first, then curves."""
+
+    segments: EdgeSet
+    curves: CurveSet
+    distribution: EdgeDistribution
+    segment_count: int
+
+
+@dataclass
+class EdgeSample:
+    """What is kept of an edge sample between kernels (detached)."""
+
+    row: mi.UInt32
+    t: mi.Float
+    aperture: mi.Point2f
+    inv_pdf: mi.Float  # 1 / (pmf of the row · number of samples)
+    lane: mi.UInt32
+
+
+def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
+    """Edges that can move on the film: of moving shapes, or of all shapes if the camera moves. None: nothing can."""
+    facts = job.facts
+    shapes = job.scene.shapes()
+    chosen = [s for s in facts.shapes if s.index >= 0 and (facts.camera_moves or s.moves)]
+    meshes = [s for s in chosen if s.is_mesh]
+    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache)
+    curves = curve_set([(shapes[s.index], s.plugin) for s in chosen if not s.is_mesh])
+    border = job.film.rfilter().border_size() if job.film.sample_border() else 0
+    weights = []
+    if segments.rows is not None:
+        weights.append(film_weights.segment_weights(segments, frame, border))
+    if curves.rows is not None:
+        weights.append(film_weights.curve_weights(curves, frame, border))
+    if not weights:
+        return None
+    distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
+    if distribution.total <= 0:
+        return None
+    return PrimaryEdges(segments, curves, distribution, dr.width(weights[0]) if segments.rows is not None else 0)
+
+
+@dataclass
+class _Seen:
+    """An edge point of either table, with what only one of them needs."""
+
+    point: EdgePoint
+    straight: mi.Bool
+    local: mi.Point3f  # curves: material point
+    scale: mi.Float  # curves: size of the shape
+
+
+def _edge_point(edges: PrimaryEdges, sample: EdgeSample, frame: SensorFrame) -> _Seen:
+    straight = sample.row < edges.segment_count
+    local, scale, point = mi.Point3f(0), mi.Float(0), None
+    if edges.segments.rows is not None:
+        point = segment_point(edges.segments, sample.row, sample.t, frame, sample.aperture, straight)
+    if edges.curves.rows is not None:
+        row = sample.row - edges.segment_count
+        on_curve, local, scale = curve_row_point(edges.curves, row, sample.t, frame, sample.aperture, ~straight)
+        point = on_curve if point is None else dr.select(straight, point, on_curve)
+    return _Seen(point, straight, local, scale)
+
+
+def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSample:
+    """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
+    lower, upper = films.sampled_window(job.film)
+    crop = job.film.crop_size()
+    count = job.spp * int(crop[0]) * int(crop[1])
+    lane = dr.arange(mi.UInt32, count)
+    rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
+    row, t = sample_edge(edges.distribution, stratified(count, rng.next_1d()))
+    aperture = rng.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
+    sample = EdgeSample(row, t, aperture, dr.rcp(pmf(edges.distribution, row) * count), lane)
+
+    seen = _edge_point(edges, sample, frame)
+    view, p = seen.point.view, seen.point.view.p
+    inside = (p.x >= lower[0]) & (p.x < upper[0]) & (p.y >= lower[1]) & (p.y < upper[1])
+    active = seen.point.valid & inside
+    # A ray aimed at a tangent point meets the shape itself: aim beside it.
+    aim = seen.point.x + dr.select(seen.straight, 0, VISIBILITY_EPSILON * seen.scale) * seen.point.side
+    direction = aim - view.o
+    distance = dr.norm(direction)
+    ray = mi.Ray3f(view.o, direction / distance)
+    ray.maxt = distance * (1 - VISIBILITY_EPSILON)
+    blocked = job.scene.ray_test(ray, active)
+    if job.options.hide_emitters:
+        pi = job.scene.ray_intersect_preliminary(ray, active=active)
+        _, pi = skip_emitters(job.scene, ray, pi)
+        blocked = pi.is_valid()
+    kept = dr.compress(active & ~blocked)
+    return dr.gather(EdgeSample, sample, kept)
+
+
+def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeSample):
+    """Radiance and coverage on the − and + side of every sample: `(L, alpha, wavelengths, differs)`, 2 lanes each."""
+    n = dr.width(sample.row)
+    index = dr.arange(mi.UInt32, 2 * n)
+    which, s = index & 1, dr.gather(EdgeSample, sample, index >> 1)
+    seen = _edge_point(edges, s, frame)
+    side, differs = None, mi.Bool(True)
+    if edges.segments.rows is not None:
+        side, differs = segment_sides(edges.segments, s.row, s.t, seen.point, which, seen.straight)
+    if edges.curves.rows is not None:
+        beside = curve_sides(seen.point, seen.scale, which)
+        side = beside if side is None else dr.select(seen.straight, side, beside)
+        differs |= ~seen.straight
+
+    rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
+    ray = side.ray
+    ray.wavelengths = wavelengths
+    found = job.scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
+    pi = dr.select(side.traced, found, side.pi)
+    emission = mi.Bool(True)
+    if job.options.hide_emitters:
+        ray, pi = skip_emitters(job.scene, ray, pi)
+        emission = mi.Bool(False)
+    L, _, surface = walk(job.scene, rng, ray, pi, job.limits, NoSink(), emission, differs)
+    L *= weight
+    alpha = dr.select(surface, mi.Float(1), 0)
+    dr.eval(L, alpha, wavelengths)
+    return L, alpha, wavelengths
+
+
+def contribution(job: Job) -> mi.TensorXf | None:
+    """The primary boundary as an image of value 0 that carries its derivative; None if no edge can move."""
+    frame = sensor_frame(job.sensor)
+    with dr.suspend_grad():
+        edges = primary_edges(job, frame)
+        if edges is None:
+            return None
+        sample = sample_visible(job, frame, edges)
+        if dr.width(sample.row) == 0:
+            return None
+        L, alpha, wavelengths = _both_sides(job, frame, edges, sample)
+        even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
+        ΔL = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
+        Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
+        wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
+        seen = _edge_point(edges, sample, frame)
+        point = seen.point
+        scale = point.speed / point.view.J_px * sample.inv_pdf
+
+    with dr.resume_grad():
+        relative = mi.Vector3f(0)
+        if edges.segments.rows is not None and job.facts.shapes_move:
+            x = segment_motion(edges.segments, sample.row, sample.t, seen.straight)
+            relative += dr.select(seen.straight, x - dr.detach(x), 0)
+        if edges.curves.rows is not None and job.facts.shapes_move:
+            x = curve_motion(edges.curves, sample.row - edges.segment_count, seen.local, ~seen.straight)
+            relative += dr.select(seen.straight, 0, x - dr.detach(x))
+        if job.facts.camera_moves:
+            ray, _ = job.sensor.sample_ray(0, 0.5, point.view.film, sample.aperture)
+            u = ray.o + ray.d * dr.detach(dr.dot(point.x - ray.o, ray.d))
+            relative -= u - dr.detach(u)
+        motion = dr.dot(point.side, relative) * scale
+        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the primary boundary along the tangents set on the scene's parameters. Detached."""
+    with dr.resume_grad():
+        image = contribution(job)
+        if image is None:
+            return films.black(job.film)
+        return dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate the primary boundary's ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.resume_grad():
+        image = contribution(job)
+        if image is None:
+            return
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)

@@ -1,0 +1,35 @@
+"""The typed errors of psdr_jit. Every message names the cause and the way out.
+
+User mistakes derive from `ValueError`, missing features from `NotImplementedError`, so that code which
+only knows Python's own hierarchy still catches what it expects.
+"""
+
+from __future__ import annotations
+
+
+class PsdrError(Exception):
+    """Root of all errors raised on purpose by psdr_jit."""
+
+
+class ParameterError(PsdrError, ValueError):
+    """A scene parameter is unknown, has the wrong type, or cannot be differentiated."""
+
+
+class OptionError(PsdrError, ValueError):
+    """An integrator or command-line option is out of its range."""
+
+
+class SceneError(PsdrError, ValueError):
+    """The scene itself is malformed: unreadable file, empty mesh, NaN vertices."""
+
+
+class UnsupportedError(PsdrError, NotImplementedError):
+    """The scene is valid, but asks for a term or feature that psdr_jit does not model."""
+
+
+class SetupError(PsdrError, RuntimeError):
+    """The machine lacks something psdr_jit needs, such as a working LLVM."""
+
+
+class UnsupportedWarning(UserWarning):
+    """A part of the derivative is not modelled; the message names it."""

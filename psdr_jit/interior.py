@@ -1,0 +1,164 @@
+"""Interior term in *spatial* form: the derivative of every path's contribution while its directions stay fixed.
+
+A path x_1, …, x_N leaves the sensor along ray 1; every later ray keeps its direction ω_k while the parameter
+θ changes, so each vertex slides along the ray that reaches it:
+
+    u_{k+1} = u_k − ω_k · n·(u_k − v_{k+1}) / (n·ω_k)                                    (motion transport)
+
+with v the material velocity of the surface and u_1 given by the attached camera ray. This is the "original"
+parameterisation of [Zhang et al. 2020, §4, Eq. 14-17]; differentiating Mitsuba's ray-triangle intersection with an
+attached origin produces exactly this recursion. The contribution of vertex k then is
+
+    L_k = f(ω_y) · L_e(y→x_k) · G(x_k, y) |dA(y)/dA_0| / p                               (emitter point y: material form)
+        + w_k · L_{k+1},       w_k = f(ω_{k+1}) / p                                     (continuation: direction fixed)
+
+Emission is in *material* form whether y was found by emitter or by BSDF sampling (both MIS partners estimate one
+integral, so they must move y alike): an area light's outline then is no discontinuity of this term. Infinitely
+distant emitters keep the direction, delta emitters follow their own attached pose. The visibility
+discontinuities of this flow are left to the boundary terms.
+
+Forward mode walks away from the sensor carrying tangents (ȯ, β̇); backward mode walks back towards it carrying the
+adjoint of the ray origin and the radiance of the rest of the path. Both replay the same recorded vertices
+(`path_records.py`) and call the same `vertex_terms`, so they agree to rounding and neither traces a ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .path_records import PathRecords
+from .records import Hit, Vertex
+
+
+@dataclass
+class VertexTerms:
+    """Attached terms of one vertex (see the module's equations)."""
+
+    x: mi.Point3f  # the vertex, sliding along its ray
+    L: mi.Spectrum  # direct light scattered at x (both MIS partners), plus emission if it is the first vertex
+    w: mi.Spectrum  # factor on what arrives from the next vertex
+
+
+def emission_towards(x: mi.Point3f, hit: Hit, emitter: mi.EmitterPtr, active: mi.Bool):
+    """Emission of the material point `hit` towards the attached point `x`: `(ω, value)`, both attached.
+
+    `value` = L_e · [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
+    emitter is infinitely distant and its direction stays as it is.
+    """
+    ray = mi.Ray3f(dr.detach(x), hit.d)
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    on_surface = active & si.is_valid()
+    offset = si.p - x
+    dist2 = dr.squared_norm(offset)
+    ω = mi.Vector3f(hit.d)
+    ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
+    area = dr.norm(dr.cross(si.dp_du, si.dp_dv))  # at fixed (u, v): |dA| up to a constant
+    measure = dr.abs_dot(si.n, ω) / dist2 * area
+    value = emitter.eval(si, active) * dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
+    return ω, value
+
+
+def _next_event(si, bsdf, nee, delta_emitters: bool):
+    """Scattered emitter sample, attached: f(ω) · value · weight."""
+    active = nee.emitter != 0
+    emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
+    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), emitter, active)
+    if delta_emitters:
+        is_delta = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+        ds, value_delta = emitter.sample_direction(si, mi.Point2f(0.5), is_delta)
+        ω = dr.select(is_delta, ds.d, ω)
+        value = dr.select(is_delta, value_delta, value)
+    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
+    return dr.select(active, f * value * nee.weight, 0)
+
+
+def vertex_terms(
+    scene: mi.Scene,
+    vertex: Vertex,
+    following: Hit,
+    weight_following: mi.Float,
+    ray: mi.Ray3f,
+    first: mi.Bool,
+    delta_emitters: bool,
+) -> VertexTerms:
+    """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
+    ctx = mi.BSDFContext()
+    si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
+    L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
+
+    bsdf = si.bsdf()
+    L += _next_event(si, bsdf, vertex.nee, delta_emitters)
+
+    goes_on = vertex.inv_pdf > 0
+    w = bsdf.eval(ctx, si, si.to_local(following.d), goes_on) * vertex.inv_pdf
+
+    found = following.intersection()
+    emitter = dr.select(found.is_valid(), found.shape.emitter(), scene.environment())
+    emits = goes_on & (weight_following > 0) & (emitter != None)  # noqa: E711 (an array comparison)
+    ω, value = emission_towards(si.p, following, emitter, emits)
+    f = bsdf.eval(ctx, si, si.to_local(ω), emits)
+    L += dr.select(emits, f * value * (vertex.inv_pdf * weight_following), 0)
+    return VertexTerms(si.p, L, w)
+
+
+@dr.syntax
+def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, delta_emitters: bool):
+    """Accumulate ⟨δL, dL⟩ into the scene's parameters; returns the adjoints `(λ_o, λ_d)` of the camera rays.
+
+    `δL`: adjoint of each path's radiance, detached.
+    """
+    k = mi.UInt32(records.count)
+    rest = mi.Spectrum(0)  # radiance that the next vertex sends back, without its own emission
+    λ_o = mi.Vector3f(0)
+    λ_d = mi.Vector3f(0)
+    δL = mi.Spectrum(δL)
+    active = k > 0
+    while dr.hint(active, label="psdr.interior.backward"):
+        k -= 1
+        v = records.vertex(k, active)
+        following, weight_following = records.arrival(k + 1, active & (v.inv_pdf > 0))
+        with dr.resume_grad():
+            o = mi.Point3f(v.hit.o)
+            d = mi.Vector3f(v.hit.d)
+            dr.enable_grad(o, d)
+            t = vertex_terms(scene, v, following, weight_following, mi.Ray3f(o, d), k == 0, delta_emitters)
+            Lo = t.L + t.w * rest
+            dr.backward_from(dr.sum(δL * v.β * Lo) + dr.dot(λ_o, t.x))
+            λ_o = mi.Vector3f(dr.grad(o))
+            λ_d = mi.Vector3f(dr.grad(d))
+        rest = dr.detach(Lo)
+        active = k > 0
+    return λ_o, λ_d
+
+
+@dr.syntax
+def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f, delta_emitters: bool):
+    """Derivative of each path's radiance, given the tangents `(ȯ, ḋ)` of its camera ray. Detached result."""
+    k = mi.UInt32(0)
+    dL = mi.Spectrum(0)
+    β_grad = mi.Spectrum(0)
+    o_grad = mi.Vector3f(o_grad)
+    d_grad = mi.Vector3f(d_grad)
+    active = k < records.count
+    while dr.hint(active, label="psdr.interior.forward"):
+        v = records.vertex(k, active)
+        following, weight_following = records.arrival(k + 1, active & (v.inv_pdf > 0))
+        with dr.resume_grad():
+            o = mi.Point3f(v.hit.o)
+            d = mi.Vector3f(v.hit.d)
+            dr.enable_grad(o, d)
+            dr.set_grad(o, o_grad)
+            dr.set_grad(d, d_grad)
+            t = vertex_terms(scene, v, following, weight_following, mi.Ray3f(o, d), k == 0, delta_emitters)
+            # x is an input of L: keep the gradients of interior nodes until they have been read
+            L_grad, w_grad, x_grad = dr.forward_to(t.L, t.w, t.x, flags=dr.ADFlag.ClearEdges)
+        dL += β_grad * dr.detach(t.L) + v.β * L_grad
+        β_grad = β_grad * dr.detach(t.w) + v.β * w_grad
+        o_grad = mi.Vector3f(x_grad)
+        d_grad = mi.Vector3f(0)
+        k += 1
+        active = k < records.count
+    return dL

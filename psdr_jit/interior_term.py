@@ -1,0 +1,133 @@
+"""The interior term as an image: camera rays → recorded paths → sweep → film (estimator: `interior.py`).
+
+Only paths that touch something differentiable have a derivative. When neither camera nor emitters are attached,
+a cheap first walk without shadow rays finds those paths and only they are recorded; the rest contribute exactly 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import film as films
+from .interior import backward_sweep, forward_sweep
+from .job import Job
+from .path_records import PathRecords
+from .path_steps import PathLimits, first_hit, walk
+from .scene_analysis import SceneFacts
+from .streams import Stream, lane_sampler, stream_seed
+from .touch import count_vertices, touches
+
+#: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
+NOMINAL_DEPTH = 16
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
+
+    spp: int
+    share: float  # of the term's samples
+    seed: mi.UInt32
+    ray: mi.RayDifferential3f
+    weight: mi.Spectrum
+    pos: mi.Point2f
+
+
+def _passes(job: Job):
+    """Split the wavefront so that the records of one pass fit into `record_mib`. Same split in both modes."""
+    film = job.film
+    lower, upper = films.sampled_window(film)
+    pixels = int((upper - lower).prod())
+    depth = min(job.options.depth_limit, NOMINAL_DEPTH)
+    budget = job.options.record_mib * 2**20 // (PathRecords.BYTES_RGB * max(depth, 1) * pixels)
+    per_pass = max(1, min(job.spp, budget))
+    done = 0
+    while done < job.spp:
+        spp = min(per_pass, job.spp - done)
+        seed = stream_seed(mi.UInt32(job.seed) + done, Stream.INTERIOR)
+        sampler, actual = job.integrator.prepare(job.sensor, seed, spp, [])
+        ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
+        yield _Pass(actual, spp / job.spp, seed, ray, weight, pos)
+        done += spp
+
+
+def every_path_differs(facts: SceneFacts) -> bool:
+    """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
+    emission = any(e.pose or e.radiance for e in facts.emitters)
+    moving_lights = any(s.is_emitter and s.geometry for s in facts.shapes)
+    return facts.camera_moves or emission or moving_lights
+
+
+def touch_table(job: Job) -> mi.UInt32:
+    """By shape registry index: 1 if scattering there depends on an enabled parameter."""
+    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, job.scene.shapes_dr())]
+    table = [0] * (max(ids, default=0) + 1)
+    for shape in job.facts.shapes:
+        if shape.index >= 0 and (shape.geometry or shape.shading or shape.material):
+            table[ids[shape.index]] = 1
+    return mi.UInt32(table)
+
+
+def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
+    """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
+    limits, facts = job.limits, job.facts
+    ray = mi.Ray3f(dr.detach(p.ray))
+    lane = dr.arange(mi.UInt32, dr.width(p.pos))
+    dr.eval(ray, lane)
+
+    if not every_path_differs(facts):
+        found = touches(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job))
+        lane = dr.compress(found)
+        if dr.width(lane) == 0:
+            return PathRecords(0, 0), lane
+        ray = dr.gather(mi.Ray3f, ray, lane)
+
+    depth = limits.max_depth
+    if job.options.max_depth == -1:
+        depth = count_vertices(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters)
+    records = PathRecords(dr.width(lane), depth)
+    ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
+    sampler = lane_sampler(p.seed, lane)
+    _, records.count, _ = walk(
+        job.scene, sampler, ray, pi, PathLimits(depth, limits.rr_depth), records, emission, mi.Bool(True)
+    )
+    dr.eval(records.count, records.vertices)
+    return records, lane
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
+    image = 0
+    with dr.suspend_grad():
+        for p in _passes(job):
+            records, lane = _record(job, p)
+            dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+            if dr.width(lane) > 0:
+                o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+                if job.facts.camera_moves:
+                    with dr.resume_grad():
+                        o_grad, d_grad = dr.forward_to(p.ray.o, p.ray.d, flags=dr.ADFlag.ClearEdges)
+                recorded = forward_sweep(job.scene, records, o_grad, d_grad, job.facts.has_delta_emitters)
+                dr.scatter(dL, recorded, lane)
+                dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
+            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+    return image
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.suspend_grad():
+        for p in _passes(job):
+            records, lane = _record(job, p)
+            if dr.width(lane) == 0:
+                continue
+            δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
+            δL = dr.gather(mi.Spectrum, δL, lane)
+            λ_o, λ_d = backward_sweep(job.scene, records, δL, job.facts.has_delta_emitters)
+            if job.facts.camera_moves:
+                with dr.resume_grad():
+                    dr.backward_from(dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d))
+            dr.eval()

@@ -1,0 +1,63 @@
+"""Memory for the vertices of a wavefront of paths, so that derivatives can be taken without tracing again."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .records import EmitterSample, Hit, Vertex
+
+
+def _empty_hit(size: int) -> Hit:
+    return Hit(
+        o=dr.empty(mi.Point3f, size),
+        d=dr.empty(mi.Vector3f, size),
+        t=dr.empty(mi.Float, size),
+        shape=dr.empty(mi.UInt32, size),
+        prim_index=dr.empty(mi.UInt32, size),
+        prim_uv=dr.empty(mi.Point2f, size),
+    )
+
+
+class PathRecords:
+    """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
+
+    A plain class on purpose: Dr.Jit must not take the buffers for loop state. Costs `BYTES_RGB` per vertex.
+    """
+
+    BYTES_RGB = 4 * (11 + 3 + 1 + 10 + 1)
+
+    def __init__(self, lanes: int, depth: int):
+        size = lanes * depth
+        self.lanes, self.depth = lanes, depth
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
+        self.vertices = Vertex(
+            hit=_empty_hit(size),
+            β=dr.empty(mi.Spectrum, size),
+            weight_emission=dr.empty(mi.Float, size),
+            nee=EmitterSample(
+                emitter=dr.empty(mi.UInt32, size),
+                shape=dr.empty(mi.UInt32, size),
+                prim_index=dr.empty(mi.UInt32, size),
+                prim_uv=dr.empty(mi.Point2f, size),
+                d=dr.empty(mi.Vector3f, size),
+                t=dr.empty(mi.Float, size),
+                weight=dr.empty(mi.Float, size),
+            ),
+            inv_pdf=dr.empty(mi.Float, size),
+        )
+
+    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
+        """Store vertex `k` of the active lanes (the sink interface of `path_steps.walk`)."""
+        dr.scatter(self.vertices, vertex, k * self.lanes + self.lane, active, mode=dr.ReduceMode.Permute)
+
+    def vertex(self, k: mi.UInt32, active: mi.Bool) -> Vertex:
+        """Vertex `k` of every lane; zero where inactive."""
+        return dr.gather(Vertex, self.vertices, k * self.lanes + self.lane, active)
+
+    def arrival(self, k: mi.UInt32, active: mi.Bool) -> tuple[Hit, mi.Float]:
+        """Only how vertex `k` was reached, and the MIS weight of its emission."""
+        index = k * self.lanes + self.lane
+        hit = dr.gather(Hit, self.vertices.hit, index, active)
+        return hit, dr.gather(mi.Float, self.vertices.weight_emission, index, active)

@@ -1,0 +1,178 @@
+"""One detached light-transport walk, used by every term: emitter sampling, BSDF sampling, MIS, Russian roulette.
+
+The walk is Mitsuba's `path` (same densities, same power heuristic); it can leave a record of each vertex.
+Everything here is detached: derivatives are attached later, from the records (`interior.py`) or not at all
+(`boundary/`, whose radiances are primal quantities).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .records import EmitterSample, Hit, Vertex
+
+#: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
+SHADOW_EPSILON = 1e-3
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """Depths as in Mitsuba's `path`: `max_depth` counts segments, roulette starts at `rr_depth`."""
+
+    max_depth: int
+    rr_depth: int
+
+
+class NoSink:
+    """Receives the vertices of a walk and forgets them."""
+
+    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
+        """Store vertex number `k` (0: the first) of every active lane."""
+
+
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+    """Power heuristic a²/(a²+b²) [Veach 1997, §9.2.4], 0 where undefined. Detached."""
+    a2, b2 = dr.square(pdf_a), dr.square(pdf_b)
+    w = a2 / (a2 + b2)
+    return dr.detach(dr.select(dr.isfinite(w), w, 0))
+
+
+def sample_emitter(scene: mi.Scene, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool):
+    """Next-event estimation at `si` with one closest-hit shadow ray.
+
+    A closest hit (not an any-hit test) tells *which* point of an area light was reached, so that the light's
+    own motion can be attached later without another ray. Returns `(ds, value, hit, visible)`:
+    `value` = emitted radiance / pdf where visible.
+    """
+    ds, value = scene.sample_emitter_direction(si, sample, False, active)
+    visible = active & (ds.pdf > 0)
+    ray = si.spawn_ray_to(ds.p)
+    on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
+    reach = dr.select(on_surface, ds.dist * (1 + SHADOW_EPSILON), ray.maxt)
+    ray.maxt = reach
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=visible)
+    reached = pi.is_valid() & (pi.t >= ds.dist * (1 - SHADOW_EPSILON)) & (pi.shape.emitter() == ds.emitter)
+    visible &= dr.select(on_surface, reached, ~pi.is_valid())
+    return ds, value & visible, Hit.of(ray, pi), visible
+
+
+def continue_path(sampler, β: mi.Spectrum, η: mi.Float, k: mi.UInt32, rr_depth: int):
+    """Russian roulette after vertex `k`: `(β / survival, η, survives, 1 / survival)`. Mitsuba's criterion."""
+    β_max = dr.max(β)
+    survival = dr.select(k + 1 >= rr_depth, dr.minimum(β_max * dr.square(η), 0.95), 1)
+    survives = (β_max != 0) & (sampler.next_1d() < survival)
+    inv_survival = dr.select(survives, dr.rcp(survival), 0)
+    return β * inv_survival, η, survives, inv_survival
+
+
+@dr.syntax
+def skip_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f):
+    """Pass straight through area emitters: the ray restarted behind the last one, and what it meets."""
+    ray = mi.Ray3f(ray)
+    pi = mi.PreliminaryIntersection3f(pi)
+    active = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array comparison)
+    while dr.hint(active, label="psdr.skip_emitters"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        ray = si.spawn_ray(ray.d)
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    return ray, pi
+
+
+def first_hit(scene: mi.Scene, ray: mi.Ray3f, hide_emitters: bool):
+    """First vertex seen by a camera ray: `(ray, pi, emission)`, `emission` = lanes that count what it emits."""
+    pi = scene.ray_intersect_preliminary(ray, coherent=True)
+    if not hide_emitters:
+        return ray, pi, mi.Bool(True)
+    ray, pi = skip_emitters(scene, ray, pi)
+    return ray, pi, mi.Bool(False)
+
+
+@dr.syntax
+def walk(
+    scene: mi.Scene,
+    sampler,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    limits: PathLimits,
+    sink,
+    emission: mi.Bool,
+    active: mi.Bool,
+):
+    """Radiance that arrives along `ray`, which meets `pi`; every vertex is handed to `sink`.
+
+    `emission` masks the lanes that count what the first vertex emits. Returns `(L, vertices, scattered)`: the
+    radiance estimate, the number of vertices visited, and whether the first vertex was a surface (for alpha).
+    Detached throughout; estimator: Kajiya's path tracing with MIS [Veach 1997, §10.3].
+    """
+    max_depth, rr_depth = limits.max_depth, limits.rr_depth  # a frozen dataclass cannot be loop state
+    ctx = mi.BSDFContext()
+
+    ray = mi.Ray3f(ray)
+    pi = mi.PreliminaryIntersection3f(pi)
+    active = mi.Bool(active)
+    emission = mi.Bool(emission)
+    L = mi.Spectrum(0)
+    β = mi.Spectrum(1)
+    η = mi.Float(1)  # Russian roulette must not see the radiance compression at refraction
+    k = mi.UInt32(0)
+    prev = dr.zeros(mi.Interaction3f)
+    prev_pdf = mi.Float(1)
+    prev_delta = mi.Bool(True)
+    surface = pi.is_valid()
+
+    while dr.hint(active, label="psdr.walk"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+        ds = mi.DirectionSample3f(scene, si=si, ref=prev)
+        pdf_em = scene.pdf_emitter_direction(prev, ds, ~prev_delta)
+        weight_emission = dr.select(emission, mis_weight(prev_pdf, pdf_em), 0)
+        L += β * weight_emission * ds.emitter.eval(si, emission)
+
+        alive = si.is_valid() & (k + 1 < max_depth)
+        bsdf = si.bsdf()
+        active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, value_em, hit_em, active_em = sample_emitter(scene, si, sampler.next_2d(), active_em)
+        f_em, pdf_bsdf, bs, weight = bsdf.eval_pdf_sample(
+            ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), alive
+        )
+        mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_bsdf))
+        L[active_em] += β * mis_em * f_em * value_em
+
+        β_next, η, survives, inv_survival = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
+        alive &= survives
+
+        sink.write(
+            k,
+            Vertex(
+                hit=Hit.of(ray, pi),
+                β=β,
+                weight_emission=weight_emission,
+                nee=EmitterSample(
+                    emitter=dr.select(active_em, dr.reinterpret_array(mi.UInt32, ds.emitter), 0),
+                    shape=hit_em.shape,
+                    prim_index=hit_em.prim_index,
+                    prim_uv=hit_em.prim_uv,
+                    d=hit_em.d,
+                    t=hit_em.t,
+                    weight=dr.select(active_em, mis_em / ds.pdf, 0),
+                ),
+                inv_pdf=dr.select(alive, inv_survival / bs.pdf, 0),
+            ),
+            active,
+        )
+
+        β = β_next
+        prev = mi.Interaction3f(si)
+        prev_pdf = mi.Float(bs.pdf)
+        prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        emission = mi.Bool(True)
+        k += 1
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=alive)
+        active = alive
+
+    return L, k, surface

@@ -1,0 +1,97 @@
+"""What is supported, as data: the lists the scene analysis works from, and the README's support table."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+PLUGIN_NAMES = {
+    # shapes
+    "Mesh": "mesh", "OBJMesh": "obj", "PLYMesh": "ply", "SerializedMesh": "serialized",
+    "BlenderMesh": "blender", "Cube": "cube", "Rectangle": "rectangle", "Disk": "disk",
+    "Sphere": "sphere", "Cylinder": "cylinder", "Instance": "instance", "ShapeGroupPlugin": "shapegroup",
+    "SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh",
+    "BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve",
+    # materials
+    "SmoothDiffuse": "diffuse", "SmoothDielectric": "dielectric", "ThinDielectric": "thindielectric",
+    "SmoothConductor": "conductor", "SmoothPlastic": "plastic", "PolarizedPlastic": "pplastic",
+    "Null": "null", "RoughConductor": "roughconductor", "RoughDielectric": "roughdielectric",
+    "RoughPlastic": "roughplastic", "Principled": "principled", "PrincipledThin": "principledthin",
+    "Measured": "measured", "Hair": "hair", "MaskBSDF": "mask", "TwoSidedBRDF": "twosided",
+    "BlendBSDF": "blendbsdf", "BumpMap": "bumpmap", "NormalMap": "normalmap",
+    # emitters
+    "AreaLight": "area", "DirectionalArea": "directionalarea", "ConstantBackgroundEmitter": "constant",
+    "EnvironmentMapEmitter": "envmap", "SunskyEmitter": "sunsky", "TimedSunskyEmitter": "timed_sunsky",
+    "PointLight": "point", "SpotLight": "spot", "DirectionalEmitter": "directional",
+    "Projector": "projector",
+    # sensors
+    "PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens",
+    "OrthographicCamera": "orthographic", "BatchSensor": "batch", "RadianceMeter": "radiancemeter",
+    "IrradianceMeter": "irradiancemeter", "DistantSensor": "distant", "DistantSensorImpl": "distant",
+    # textures
+    "BitmapTexture": "bitmap", "BitmapTextureImpl": "bitmap", "Checkerboard": "checkerboard",
+    "MeshAttribute": "mesh_attribute", "VolumeAdapter": "volume",
+}  # fmt: skip
+"""C++ class name -> the name used in scene files, which is the one a message should use."""
+
+ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
+
+UNSUPPORTED_SHAPES = {
+    "instance": "load the mesh once per copy instead of instancing it",
+    "shapegroup": "load the mesh once per copy instead of instancing it",
+    "sdfgrid": "extract a mesh, for example with marching cubes",
+    "ellipsoids": "use meshes",
+    "ellipsoidsmesh": "use meshes",
+    "bsplinecurve": "tessellate the curves into a mesh",
+    "linearcurve": "tessellate the curves into a mesh",
+}
+"""Shapes without an edge set: plugin -> the way out."""
+
+SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
+"""Sensors whose film position of a scene point is known, so that edges can be projected."""
+
+JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
+"""Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
+
+POSE_PARAMETERS = frozenset({
+    "to_world", "position", "direction", "sun_direction",
+    "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second",
+})  # fmt: skip
+"""Emitter parameters that move the light; all others scale or shape what it emits."""
+
+
+class Row(NamedTuple):
+    feature: str
+    status: str  # "yes", "warning" or "error"
+    note: str
+
+
+_MOVING = "while geometry, a light's pose or the camera is differentiated; "
+
+SUPPORT = (
+    Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
+    Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
+    Row("instances, SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("shape geometry, materials, textures", "yes", ""),
+    Row("camera pose and intrinsics", "yes", ""),
+    Row("perspective, thin lens, orthographic sensor", "yes", ""),
+    Row("batch and other sensors", "error", _MOVING + "render a batch one sensor at a time"),
+    Row("area, constant, environment map", "yes", ""),
+    Row("point, spot, directional light", "yes", "a spot without a soft rim: warning"),
+    Row("projector", "warning", _MOVING + "the frame of its picture is a step that is not sampled"),
+    Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
+    Row("rough and diffuse materials", "yes", ""),
+    Row("mirrors, smooth glass and plastic, null, mask, hair", "error",
+        _MOVING + "motion transport through specular vertices is missing"),
+    Row("checkerboard, nearest-neighbour bitmap, bump map, face attributes", "warning",
+        _MOVING + "steps inside a surface may slide and are not sampled"),
+    Row("participating media", "error", "ignored by Mitsuba's path as well"),
+    Row("polarised variants", "error", ""),
+    Row("NaN vertices, empty meshes", "error", ""),
+    Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
+)  # fmt: skip
+
+
+def support_table() -> str:
+    """`SUPPORT` as a Markdown table."""
+    rows = [f"| {row.feature} | {row.status} | {row.note} |" for row in SUPPORT]
+    return "\n".join(["| feature | status | note |", "|---|---|---|", *rows])

@@ -1,0 +1,61 @@
+"""Walks that only look: which paths meet something differentiable, and how long do paths get?
+
+They draw the same random numbers in the same order as `path_steps.walk`, so they follow the same paths.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .path_steps import PathLimits, continue_path, first_hit
+
+
+@dr.syntax
+def touches(
+    scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool, table: mi.UInt32
+) -> mi.Bool:
+    """Does the path scatter at a shape whose entry in `table` (by registry index) is not 0? Detached.
+
+    The last vertex only emits, and emitters are not in question here, so its ray is never traced.
+    """
+    max_depth, rr_depth = limits.max_depth, limits.rr_depth  # a frozen dataclass cannot be loop state
+    ray, pi, _emission = first_hit(scene, ray, hide_emitters)
+    found = mi.Bool(False)
+    β = mi.Spectrum(1)
+    η = mi.Float(1)
+    k = mi.UInt32(0)
+    active = pi.is_valid() & (k + 1 < max_depth)
+    while dr.hint(active, label="psdr.touches"):
+        found |= dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, pi.shape), active) != 0
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        sampler.next_2d()  # spent on emitter sampling in `walk`
+        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+        β, η, alive, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
+        k += 1
+        active = alive & ~found & (k + 1 < max_depth)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active &= pi.is_valid()
+    return found
+
+
+@dr.syntax
+def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool) -> int:
+    """Largest number of vertices among the paths that `walk` would trace (evaluates; unlimited depth only)."""
+    rr_depth = limits.rr_depth
+    ray, pi, _emission = first_hit(scene, ray, hide_emitters)
+    β = mi.Spectrum(1)
+    η = mi.Float(1)
+    k = mi.UInt32(0)
+    active = pi.is_valid()
+    while dr.hint(active, label="psdr.count_vertices"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        sampler.next_2d()
+        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+        β, η, active, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
+        k += 1
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active &= pi.is_valid()
+    return int(dr.max(k)[0]) + 1
