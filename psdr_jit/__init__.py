@@ -17,16 +17,13 @@ from __future__ import annotations
 
 __version__ = "0.1.0"
 
+from .drjit_libraries import mitsuba_can_load as _mitsuba_can_load
 from .llvm import apply_saved_choice as _apply_saved_choice
 
 _apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
 
-try:
+if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is wrong
     from . import plugins as plugins  # registers the integrators, now and after every variant switch
-except ModuleNotFoundError as error:  # `psdr doctor` must be able to say so
-    if error.name not in ("mitsuba", "drjit"):
-        raise
-else:
     from .check import CheckResult, check_gradient
     from .gradient import GradientResult, gradient
     from .params import ParamInfo, differentiable_params

@@ -1,0 +1,118 @@
+"""The `psdr` command: finds the subcommand, makes sure that LLVM works, maps errors to exit statuses.
+
+0 success; 1 a check failed; 2 wrong usage or input; 3 the machine lacks something; 130 interrupted. A
+subcommand is a module with `NAME`, `HELP`, `add_arguments(parser)` and `run(args) -> int`. It is imported
+only when it is the one asked for, so that `psdr --help` needs neither Mitsuba nor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+from dataclasses import dataclass
+
+import psdr_jit
+from psdr_jit.errors import PsdrError, SetupError
+
+OK, USAGE, SETUP_MISSING, INTERRUPTED = 0, 2, 3, 130
+TRACEBACK_VARIABLE = "PSDR_TRACEBACK"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One line of the help, and the module behind it."""
+
+    module: str
+    help: str
+    renders: bool  # needs a working backend before it runs
+
+
+COMMANDS = {
+    "render": Command("psdr_jit.cli.render", "render a scene", renders=True),
+    "gradient": Command(
+        "psdr_jit.cli.gradient", "differentiate a scene by one of its parameters", renders=True
+    ),
+    "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
+    "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),
+    "doctor": Command("psdr_jit.cli.doctor", "check Python, Mitsuba, Dr.Jit and LLVM", renders=False),
+    "test": Command("psdr_jit.cli.test", "run the test suite (needs a clone)", renders=False),
+}
+
+
+def build_parser(wanted: str | None) -> argparse.ArgumentParser:
+    """The parser; only the subcommand `wanted` gets its arguments."""
+    parser = argparse.ArgumentParser(prog="psdr", description=psdr_jit.__doc__)
+    parser.add_argument("--version", action="version", version=f"psdr_jit {psdr_jit.__version__}")
+    parser.epilog = f"{TRACEBACK_VARIABLE}=1 shows the Python traceback of an error."
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, command in COMMANDS.items():
+        if name == wanted:
+            module = importlib.import_module(command.module)
+            subparser = subparsers.add_parser(name, help=command.help, description=module.__doc__)
+            subparser.formatter_class = argparse.RawDescriptionHelpFormatter
+            module.add_arguments(subparser)
+            subparser.set_defaults(run=module.run)
+        else:
+            subparsers.add_parser(name, help=command.help)
+    return parser
+
+
+def prepare_backend(args: argparse.Namespace, restart: bool) -> None:
+    """Make sure that a kernel can be compiled. A variant that was asked for by name may not need LLVM.
+
+    `import mitsuba` has loaded an LLVM already. If the choice turns out to be another (first use after a
+    plain `pip install`, or a library was removed), only a new process can load that one: `restart`.
+    """
+    variant = getattr(args, "variant", None) or ""
+    if variant.startswith(("cuda", "scalar")):
+        return
+    from psdr_jit import llvm
+
+    before = os.environ.get(llvm.VARIABLE)
+    choice = llvm.ensure_llvm()
+    if restart and choice.path != before and "drjit" in sys.modules:
+        sys.stdout.flush()
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def dispatch(argv: list[str], restart: bool) -> int:
+    """Parse and run."""
+    wanted = next((word for word in argv if not word.startswith("-")), None)
+    parser = build_parser(wanted)
+    if wanted == "test":  # pytest's options are not ours to know
+        args, args.pytest_args = parser.parse_args([wanted]), argv[argv.index(wanted) + 1 :]
+    else:
+        args = parser.parse_args(argv)
+    if COMMANDS[args.command].renders:
+        prepare_backend(args, restart)
+    return args.run(args)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the console script."""
+    try:
+        return dispatch(sys.argv[1:] if argv is None else argv, restart=argv is None)
+    except PsdrError as error:
+        if os.environ.get(TRACEBACK_VARIABLE) == "1":
+            traceback.print_exc()
+        print(f"psdr: error: {error}", file=sys.stderr)
+        return SETUP_MISSING if isinstance(error, SetupError) else USAGE
+    except ModuleNotFoundError as error:
+        if (error.name or "psdr_jit").split(".")[0] == "psdr_jit":
+            raise  # a defect of ours, not of the set-up
+        print(f"psdr: error: the package '{error.name}' is not installed; see: psdr doctor", file=sys.stderr)
+        return SETUP_MISSING
+    except KeyboardInterrupt:
+        print("psdr: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader (`| head`) has left. Python would complain once more when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

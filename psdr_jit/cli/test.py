@@ -1,0 +1,53 @@
+"""Run the test suite of this checkout. Extra arguments go to pytest, e.g.: psdr test -k edges -m slow"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psdr_jit
+from psdr_jit import drjit_libraries, llvm
+from psdr_jit.errors import SetupError
+
+NAME = "test"
+HELP = "run the test suite (needs a clone)"
+
+EXIT_STATUS = {0: 0, 4: 2, 5: 2}  # pytest: all passed; wrong usage; nothing selected
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """For the help text only: `main` hands over everything that follows `test` unparsed."""
+    parser.add_argument("pytest_args", nargs="*", metavar="ARG", help="passed on to pytest")
+
+
+def checkout() -> Path:
+    """Root of the clone that this package was imported from."""
+    root = Path(psdr_jit.__file__).resolve().parents[1]
+    if not (root / "pyproject.toml").is_file() or not (root / "tests").is_dir():
+        raise SetupError(
+            "the tests are not part of the installed package; clone the repository and run:  ./psdr test"
+        )
+    return root
+
+
+def run(args: argparse.Namespace) -> int:
+    """pytest's verdict as one of ours; a crash or an error while collecting is a failed check."""
+    root = checkout()
+    if importlib.util.find_spec("pytest") is None:
+        raise SetupError(f"pytest is not installed; run:  {sys.executable} -m pip install -e '{root}[test]'")
+    llvm.ensure_llvm()
+    given = [absolute(word, root) for word in args.pytest_args]
+    environment = {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
+    command = [sys.executable, "-m", "pytest", *given]
+    status = subprocess.run(command, cwd=root, env=environment, check=False).returncode
+    return EXIT_STATUS.get(status, 1)
+
+
+def absolute(word: str, root: Path) -> str:
+    """pytest runs in the checkout; a path relative to where the user stands must survive that."""
+    path = word.split("::", 1)[0]
+    return os.path.abspath(word) if os.path.exists(path) and not (root / path).exists() else word
