@@ -47,10 +47,10 @@ def _passes(job: Job):
     done = 0
     while done < job.spp:
         spp = min(per_pass, job.spp - done)
-        seed = stream_seed(mi.UInt32(job.seed) + done, Stream.INTERIOR)
+        seed = stream_seed(mi.UInt32(job.seed) + done, Stream.CAMERA)
         sampler, actual = job.integrator.prepare(job.sensor, seed, spp, [])
         ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
-        yield _Pass(actual, spp / job.spp, seed, ray, weight, pos)
+        yield _Pass(actual, spp / job.spp, stream_seed(seed, Stream.INTERIOR), ray, weight, pos)
         done += spp
 
 

@@ -12,7 +12,8 @@ import mitsuba as mi
 class Stream(IntEnum):
     """One entry per independent consumer of random numbers; the value enters the seed, so never reuse one."""
 
-    INTERIOR = 0
+    CAMERA = 0
+    INTERIOR = 3  # not the camera's: Mitsuba's samplers hash (seed, lane) as `lane_sampler` does
     PRIMARY_EDGE = 1
     PRIMARY_RADIANCE = 2
 
