@@ -9,6 +9,7 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from psdr_jit import film as films
 from psdr_jit.job import Job
 from psdr_jit.options import Options, samples_per_pixel
+from psdr_jit.rejected import Rejected
 from psdr_jit.scene_analysis import analyse
 from psdr_jit.scene_checks import require_supported
 from psdr_jit.terms import TERMS
@@ -21,6 +22,7 @@ class TermIntegrator(ADIntegrator):
         self.options = Options.from_properties(props)
         super().__init__(props)
         self.cache: dict = {}
+        self.stats = {"rejected": Rejected()}
         self._path = mi.load_dict(
             {
                 "type": "path",
@@ -45,7 +47,22 @@ class TermIntegrator(ADIntegrator):
         for term in TERMS:
             budget = samples_per_pixel(getattr(self.options, term.budget), spp, sampler_spp)
             if budget > 0:
-                jobs.append((term, Job(self, scene, sensor, facts, self.options, self.cache, seed, budget)))
+                jobs.append(
+                    (
+                        term,
+                        Job(
+                            self,
+                            scene,
+                            sensor,
+                            facts,
+                            self.options,
+                            self.cache,
+                            self.stats["rejected"],
+                            seed,
+                            budget,
+                        ),
+                    )
+                )
         return jobs
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):

@@ -151,7 +151,9 @@ def _is_seam(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice, angle: mi.Float
         seam |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
     bsdf = mesh.bsdf()
     textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    textured |= mesh.emitter() is not None and mi.has_flag(mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying)
+    textured |= mesh.emitter() is not None and mi.has_flag(
+        mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying
+    )
     if textured and mesh.has_vertex_texcoords():
         seam |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
     return seam

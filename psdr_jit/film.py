@@ -35,7 +35,9 @@ def _put(block: mi.ImageBlock, film: mi.Film, pos, value, alpha, weight, wavelen
     block.put(pos, channels + [weight], active)
 
 
-def develop_samples(film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool) -> mi.TensorXf:
+def develop_samples(
+    film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool
+) -> mi.TensorXf:
     """Weighted mean of per-sample values as Mitsuba's renderers form it; attached where `value` is.
 
     `pos`: film positions [px]. Alpha is constant along this term, so its derivative is written as 0.
@@ -48,7 +50,9 @@ def develop_samples(film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, waveleng
     return film.develop()
 
 
-def sample_adjoint(film: mi.Film, pos: mi.Point2f, grad_in: mi.TensorXf, wavelengths, coalesce: bool) -> mi.Spectrum:
+def sample_adjoint(
+    film: mi.Film, pos: mi.Point2f, grad_in: mi.TensorXf, wavelengths, coalesce: bool
+) -> mi.Spectrum:
     """Adjoint of `develop_samples`: derivative of ⟨grad_in, image⟩ with respect to each sample's value."""
     with dr.resume_grad():
         value = dr.zeros(mi.Spectrum, dr.width(pos))
@@ -69,7 +73,9 @@ def sampled_window(film: mi.Film) -> tuple[np.ndarray, np.ndarray]:
     return lower, lower + np.array(film.crop_size(), dtype=float) + 2 * border
 
 
-def _filter_mass(rfilter: mi.ReconstructionFilter, first: int, count: int, window: tuple[float, float]) -> np.ndarray:
+def _filter_mass(
+    rfilter: mi.ReconstructionFilter, first: int, count: int, window: tuple[float, float]
+) -> np.ndarray:
     """∫ f(x − x_i) dx over `window` for each of `count` pixel centres x_i along one axis (midpoint rule)."""
     reach = int(np.ceil(rfilter.radius()))
     nodes = (np.arange(2 * reach * FILTER_NODES) + 0.5) / FILTER_NODES - reach

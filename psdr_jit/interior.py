@@ -30,7 +30,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .path_records import PathRecords
-from .records import Hit, Vertex
+from .records import Arrival, Hit, Vertex
 
 
 @dataclass
@@ -42,14 +42,24 @@ class VertexTerms:
     w: mi.Spectrum  # factor on what arrives from the next vertex
 
 
-def emission_towards(x: mi.Point3f, hit: Hit, emitter: mi.EmitterPtr, active: mi.Bool):
+@dataclass(frozen=True)
+class SceneTraits:
+    """Which code paths a scene needs at all (fixed while tracing)."""
+
+    delta_emitters: bool
+    delta_lobes: bool  # only together with static geometry, see `scene_checks`
+
+
+def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, active: mi.Bool):
     """Emission of the material point `hit` towards the attached point `x`: `(ω, value)`, both attached.
 
     `value` = L_e · [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
     emitter is infinitely distant and its direction stays as it is.
     """
-    ray = mi.Ray3f(dr.detach(x), hit.d)
-    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
+    si = hit.intersection().compute_surface_interaction(
+        ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active
+    )
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
@@ -61,12 +71,12 @@ def emission_towards(x: mi.Point3f, hit: Hit, emitter: mi.EmitterPtr, active: mi
     return ω, value
 
 
-def _next_event(si, bsdf, nee, delta_emitters: bool):
+def _next_event(si, bsdf, nee, traits: SceneTraits):
     """Scattered emitter sample, attached: f(ω) · value · weight."""
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
-    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), emitter, active)
-    if delta_emitters:
+    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, active)
+    if traits.delta_emitters:
         is_delta = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         ds, value_delta = emitter.sample_direction(si, mi.Point2f(0.5), is_delta)
         ω = dr.select(is_delta, ds.d, ω)
@@ -76,36 +86,36 @@ def _next_event(si, bsdf, nee, delta_emitters: bool):
 
 
 def vertex_terms(
-    scene: mi.Scene,
-    vertex: Vertex,
-    following: Hit,
-    weight_following: mi.Float,
-    ray: mi.Ray3f,
-    first: mi.Bool,
-    delta_emitters: bool,
-) -> VertexTerms:
+    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits
+):
     """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
     ctx = mi.BSDFContext()
     si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
 
     bsdf = si.bsdf()
-    L += _next_event(si, bsdf, vertex.nee, delta_emitters)
+    L += _next_event(si, bsdf, vertex.nee, traits)
 
-    goes_on = vertex.inv_pdf > 0
-    w = bsdf.eval(ctx, si, si.to_local(following.d), goes_on) * vertex.inv_pdf
+    goes_on = vertex.inv_pdf != 0
+    inv_pdf = dr.abs(vertex.inv_pdf)
+    w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * inv_pdf
 
-    found = following.intersection()
+    found = following.hit.intersection()
     emitter = dr.select(found.is_valid(), found.shape.emitter(), scene.environment())
-    emits = goes_on & (weight_following > 0) & (emitter != None)  # noqa: E711 (an array comparison)
-    ω, value = emission_towards(si.p, following, emitter, emits)
-    f = bsdf.eval(ctx, si, si.to_local(ω), emits)
-    L += dr.select(emits, f * value * (vertex.inv_pdf * weight_following), 0)
+    emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
+    ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, emits)
+    w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
+    if traits.delta_lobes:
+        # A delta lobe has no value to evaluate. Its weight is the ratio of throughputs, a constant here.
+        is_delta = vertex.inv_pdf < 0
+        ratio = dr.select(vertex.β != 0, following.β / vertex.β, 0)
+        w, w_emission = dr.select(is_delta, ratio, w), dr.select(is_delta, ratio, w_emission)
+    L += dr.select(emits, w_emission * value * following.weight_emission, 0)
     return VertexTerms(si.p, L, w)
 
 
 @dr.syntax
-def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, delta_emitters: bool):
+def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, traits: SceneTraits):
     """Accumulate ⟨δL, dL⟩ into the scene's parameters; returns the adjoints `(λ_o, λ_d)` of the camera rays.
 
     `δL`: adjoint of each path's radiance, detached.
@@ -114,17 +124,16 @@ def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, delt
     rest = mi.Spectrum(0)  # radiance that the next vertex sends back, without its own emission
     λ_o = mi.Vector3f(0)
     λ_d = mi.Vector3f(0)
-    δL = mi.Spectrum(δL)
     active = k > 0
-    while dr.hint(active, label="psdr.interior.backward"):
+    while dr.hint(active, label="psdr.interior.backward", exclude=[traits]):
         k -= 1
         v = records.vertex(k, active)
-        following, weight_following = records.arrival(k + 1, active & (v.inv_pdf > 0))
+        following = records.arrival(k + 1, active & (v.inv_pdf != 0))
         with dr.resume_grad():
             o = mi.Point3f(v.hit.o)
             d = mi.Vector3f(v.hit.d)
             dr.enable_grad(o, d)
-            t = vertex_terms(scene, v, following, weight_following, mi.Ray3f(o, d), k == 0, delta_emitters)
+            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits)
             Lo = t.L + t.w * rest
             dr.backward_from(dr.sum(δL * v.β * Lo) + dr.dot(λ_o, t.x))
             λ_o = mi.Vector3f(dr.grad(o))
@@ -135,7 +144,7 @@ def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, delt
 
 
 @dr.syntax
-def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f, delta_emitters: bool):
+def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits: SceneTraits) -> mi.Spectrum:
     """Derivative of each path's radiance, given the tangents `(ȯ, ḋ)` of its camera ray. Detached result."""
     k = mi.UInt32(0)
     dL = mi.Spectrum(0)
@@ -143,16 +152,16 @@ def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad: mi.Vector3f, d_
     o_grad = mi.Vector3f(o_grad)
     d_grad = mi.Vector3f(d_grad)
     active = k < records.count
-    while dr.hint(active, label="psdr.interior.forward"):
+    while dr.hint(active, label="psdr.interior.forward", exclude=[traits]):
         v = records.vertex(k, active)
-        following, weight_following = records.arrival(k + 1, active & (v.inv_pdf > 0))
+        following = records.arrival(k + 1, active & (v.inv_pdf != 0))
         with dr.resume_grad():
             o = mi.Point3f(v.hit.o)
             d = mi.Vector3f(v.hit.d)
             dr.enable_grad(o, d)
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            t = vertex_terms(scene, v, following, weight_following, mi.Ray3f(o, d), k == 0, delta_emitters)
+            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits)
             # x is an input of L: keep the gradients of interior nodes until they have been read
             L_grad, w_grad, x_grad = dr.forward_to(t.L, t.w, t.x, flags=dr.ADFlag.ClearEdges)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad

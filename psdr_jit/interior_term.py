@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import film as films
-from .interior import backward_sweep, forward_sweep
+from .interior import SceneTraits, backward_sweep, forward_sweep
 from .job import Job
 from .path_records import PathRecords
 from .path_steps import PathLimits, first_hit, walk
@@ -79,7 +79,9 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     dr.eval(ray, lane)
 
     if not every_path_differs(facts):
-        found = touches(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job))
+        found = touches(
+            job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job)
+        )
         lane = dr.compress(found)
         if dr.width(lane) == 0:
             return PathRecords(0, 0), lane
@@ -94,8 +96,21 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     _, records.count, _ = walk(
         job.scene, sampler, ray, pi, PathLimits(depth, limits.rr_depth), records, emission, mi.Bool(True)
     )
+    records.wavelengths = ray.wavelengths
     dr.eval(records.count, records.vertices)
     return records, lane
+
+
+def _traits(facts: SceneFacts) -> SceneTraits:
+    return SceneTraits(facts.has_delta_emitters, any(s.delta_lobes for s in facts.shapes))
+
+
+def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
+    """How far the recorded camera rays start beyond the sensor's own: behind hidden emitters, 0 otherwise [m]."""
+    if not job.options.hide_emitters:
+        return mi.Float(0)
+    first = records.vertex(mi.UInt32(0), records.count > 0)
+    return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -110,10 +125,16 @@ def forward(job: Job) -> mi.TensorXf:
                 if job.facts.camera_moves:
                     with dr.resume_grad():
                         o_grad, d_grad = dr.forward_to(p.ray.o, p.ray.d, flags=dr.ADFlag.ClearEdges)
-                recorded = forward_sweep(job.scene, records, o_grad, d_grad, job.facts.has_delta_emitters)
+                    o_grad = o_grad + _skipped(job, p, records) * d_grad
+                recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job.facts))
+                recorded = job.rejected.keep_finite(recorded)
                 dr.scatter(dL, recorded, lane)
-                dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
-            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+                dr.eval(
+                    dL
+                )  # the splat below reads it inside a recorded loop, where pending writes are not seen
+            image += p.share * films.develop_samples(
+                job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4
+            )
     return image
 
 
@@ -124,10 +145,15 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue
-            δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
+            δL = (
+                p.share
+                * p.weight
+                * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
+            )
             δL = dr.gather(mi.Spectrum, δL, lane)
-            λ_o, λ_d = backward_sweep(job.scene, records, δL, job.facts.has_delta_emitters)
+            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job.facts))
             if job.facts.camera_moves:
+                λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():
                     dr.backward_from(dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d))
             dr.eval()

@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from .options import Options
 from .path_steps import PathLimits
+from .rejected import Rejected
 from .scene_analysis import SceneFacts
 
 
@@ -21,6 +22,7 @@ class Job:
     facts: SceneFacts
     options: Options
     cache: dict  # the integrator's: edge sets that outlive a call
+    rejected: Rejected  # the integrator's: counts dropped samples
     seed: int | mi.UInt32
     spp: int
 

@@ -30,7 +30,9 @@ class Options:
         if self.max_depth < 0 and self.max_depth != -1:
             raise OptionError(f"max_depth = {self.max_depth}: use a depth >= 0, or -1 for unlimited")
         if self.rr_depth <= 0:
-            raise OptionError(f"rr_depth = {self.rr_depth}: use a depth >= 1 (a large one switches roulette off)")
+            raise OptionError(
+                f"rr_depth = {self.rr_depth}: use a depth >= 1 (a large one switches roulette off)"
+            )
         for name in ("sppc", "sppp", "sppi", "sppd"):
             value = getattr(self, name)
             if value is not None and value < 0:

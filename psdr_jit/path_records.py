@@ -5,7 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .records import EmitterSample, Hit, Vertex
+from .path_steps import shadow_hit
+from .records import Arrival, EmitterSample, Hit, Vertex
 
 
 def _empty_hit(size: int) -> Hit:
@@ -27,11 +28,14 @@ class PathRecords:
 
     BYTES_RGB = 4 * (11 + 3 + 1 + 10 + 1)
 
+    connect = staticmethod(shadow_hit)
+
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.lanes, self.depth = lanes, depth
         self.lane = dr.arange(mi.UInt32, lanes)
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
+        self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
         self.vertices = Vertex(
             hit=_empty_hit(size),
             β=dr.empty(mi.Spectrum, size),
@@ -56,8 +60,12 @@ class PathRecords:
         """Vertex `k` of every lane; zero where inactive."""
         return dr.gather(Vertex, self.vertices, k * self.lanes + self.lane, active)
 
-    def arrival(self, k: mi.UInt32, active: mi.Bool) -> tuple[Hit, mi.Float]:
-        """Only how vertex `k` was reached, and the MIS weight of its emission."""
+    def arrival(self, k: mi.UInt32, active: mi.Bool) -> Arrival:
+        """Only how vertex `k` was reached, and what its emission counts."""
         index = k * self.lanes + self.lane
-        hit = dr.gather(Hit, self.vertices.hit, index, active)
-        return hit, dr.gather(mi.Float, self.vertices.weight_emission, index, active)
+        v = self.vertices
+        return Arrival(
+            hit=dr.gather(Hit, v.hit, index, active),
+            β=dr.gather(mi.Spectrum, v.β, index, active),
+            weight_emission=dr.gather(mi.Float, v.weight_emission, index, active),
+        )

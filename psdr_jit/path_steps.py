@@ -26,13 +26,6 @@ class PathLimits:
     rr_depth: int
 
 
-class NoSink:
-    """Receives the vertices of a walk and forgets them."""
-
-    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
-        """Store vertex number `k` (0: the first) of every active lane."""
-
-
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     """Power heuristic a²/(a²+b²) [Veach 1997, §9.2.4], 0 where undefined. Detached."""
     a2, b2 = dr.square(pdf_a), dr.square(pdf_b)
@@ -40,23 +33,32 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     return dr.detach(dr.select(dr.isfinite(w), w, 0))
 
 
-def sample_emitter(scene: mi.Scene, si: mi.SurfaceInteraction3f, sample: mi.Point2f, active: mi.Bool):
-    """Next-event estimation at `si` with one closest-hit shadow ray.
+def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
+    """Is the emitter sample visible from `si`? Any-hit ray; returns `(hit, visible)` with an empty hit."""
+    occluded = scene.ray_test(si.spawn_ray_to(ds.p), active)
+    return dr.zeros(Hit), active & ~occluded
 
-    A closest hit (not an any-hit test) tells *which* point of an area light was reached, so that the light's
-    own motion can be attached later without another ray. Returns `(ds, value, hit, visible)`:
-    `value` = emitted radiance / pdf where visible.
+
+def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
+    """The same with a closest-hit ray, which also tells *which* point of an area light was reached.
+
+    With it the light's own motion can be attached later without another ray. Returns `(hit, visible)`.
     """
-    ds, value = scene.sample_emitter_direction(si, sample, False, active)
-    visible = active & (ds.pdf > 0)
     ray = si.spawn_ray_to(ds.p)
     on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
-    reach = dr.select(on_surface, ds.dist * (1 + SHADOW_EPSILON), ray.maxt)
-    ray.maxt = reach
-    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=visible)
+    ray.maxt = dr.select(on_surface, ds.dist * (1 + SHADOW_EPSILON), ray.maxt)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     reached = pi.is_valid() & (pi.t >= ds.dist * (1 - SHADOW_EPSILON)) & (pi.shape.emitter() == ds.emitter)
-    visible &= dr.select(on_surface, reached, ~pi.is_valid())
-    return ds, value & visible, Hit.of(ray, pi), visible
+    return Hit.of(ray, pi), active & dr.select(on_surface, reached, ~pi.is_valid())
+
+
+class NoSink:
+    """Receives the vertices of a walk and forgets them."""
+
+    connect = staticmethod(shadow_test)
+
+    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
+        """Store vertex number `k` (0: the first) of every active lane."""
 
 
 def continue_path(sampler, β: mi.Spectrum, η: mi.Float, k: mi.UInt32, rr_depth: int):
@@ -135,13 +137,15 @@ def walk(
         alive = si.is_valid() & (k + 1 < max_depth)
         bsdf = si.bsdf()
         active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, value_em, hit_em, active_em = sample_emitter(scene, si, sampler.next_2d(), active_em)
+        ds, value_em = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
+        hit_em, active_em = sink.connect(scene, si, ds, active_em & (ds.pdf > 0))
         f_em, pdf_bsdf, bs, weight = bsdf.eval_pdf_sample(
             ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), alive
         )
         mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_bsdf))
         L[active_em] += β * mis_em * f_em * value_em
 
+        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         β_next, η, survives, inv_survival = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
         alive &= survives
 
@@ -160,7 +164,7 @@ def walk(
                     t=hit_em.t,
                     weight=dr.select(active_em, mis_em / ds.pdf, 0),
                 ),
-                inv_pdf=dr.select(alive, inv_survival / bs.pdf, 0),
+                inv_pdf=dr.select(alive, dr.select(is_delta, -inv_survival, inv_survival) / bs.pdf, 0),
             ),
             active,
         )
@@ -168,7 +172,7 @@ def walk(
         β = β_next
         prev = mi.Interaction3f(si)
         prev_pdf = mi.Float(bs.pdf)
-        prev_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        prev_delta = mi.Bool(is_delta)
         emission = mi.Bool(True)
         k += 1
         ray = si.spawn_ray(si.to_world(bs.wo))

@@ -69,4 +69,15 @@ class Vertex:
     β: mi.Spectrum  # throughput before this vertex
     weight_emission: mi.Float  # MIS weight of the emission met here by BSDF sampling
     nee: EmitterSample
-    inv_pdf: mi.Float  # 1/(pdf_sa · Russian roulette) of the continuation, 0 where the path ended
+    inv_pdf: (
+        mi.Float
+    )  # 1/(pdf · roulette) of the continuation, 0 where the path ended, negated for a delta lobe
+
+
+@dataclass
+class Arrival:
+    """The part of a `Vertex` that its predecessor needs: how the sampled direction went on."""
+
+    hit: Hit
+    β: mi.Spectrum
+    weight_emission: mi.Float

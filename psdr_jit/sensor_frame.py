@@ -14,7 +14,11 @@ import mitsuba as mi
 
 from .errors import UnsupportedError
 
-KINDS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
+KINDS = {
+    "PerspectiveCamera": "perspective",
+    "ThinLensCamera": "thinlens",
+    "OrthographicCamera": "orthographic",
+}
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,9 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         focus, aperture = 1.0, 0.0
         if kind == "thinlens":
             params = mi.traverse(sensor)
-            focus, aperture = (float(dr.detach(mi.Float(params[k]))[0]) for k in ("focus_distance", "aperture_radius"))
+            focus, aperture = (
+                float(dr.detach(mi.Float(params[k]))[0]) for k in ("focus_distance", "aperture_radius")
+            )
     return SensorFrame(
         kind=kind,
         to_world=to_world,

@@ -75,7 +75,9 @@ def segment_motion(edges: EdgeSet, row, t, active) -> mi.Point3f:
     """The same point attached to the vertices of its mesh."""
     positions = attached_positions(edges.meshes)
     v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (edges.rows.v0, edges.rows.v1))
-    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(mi.Point3f, positions, v1, active)
+    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(
+        mi.Point3f, positions, v1, active
+    )
 
 
 def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, active) -> tuple[Side, mi.Bool]:
@@ -115,7 +117,9 @@ def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.P
     """Point at parameter `t` of a piece of an analytic curve: `(EdgePoint, local point, outward, scale)`."""
     rows = dr.gather(type(curves.rows), curves.rows, row, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, rows.shape))
-    local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture)))
+    local = curve_point(
+        rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture))
+    )
     x = transform_point(columns, local.x)
     view = look_at(frame, x, aperture)
     side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, view.ω)

@@ -36,7 +36,9 @@ def _overlaps(frame: SensorFrame, a: mi.Point2f, b: mi.Point2f, margin: mi.Float
     for axis in range(2):
         lower = frame.crop_offset[axis] - border
         upper = frame.crop_offset[axis] + frame.crop_size[axis] + border
-        inside &= (dr.maximum(a[axis], b[axis]) >= lower - margin) & (dr.minimum(a[axis], b[axis]) <= upper + margin)
+        inside &= (dr.maximum(a[axis], b[axis]) >= lower - margin) & (
+            dr.minimum(a[axis], b[axis]) <= upper + margin
+        )
     return inside
 
 
@@ -49,7 +51,9 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     z0, z1 = (frame.to_local @ rows.p0).z, (frame.to_local @ rows.p1).z
 
     s0, s1 = facing(rows.n0, rows.p0, view), facing(rows.n1, rows.p0, view)
-    slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
+    slack = (
+        frame.aperture if frame.kind == "thinlens" else 0.0
+    )  # how far the viewpoint may be from the centre
     may_be_silhouette = rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
     crease = dr.select(rows.seam, dr.clip(rows.angle / FULL_CREASE, 0, 1), 0)
     # Seams of smooth or coplanar faces (textures, split normals) have no angle to go by.
@@ -81,7 +85,10 @@ def _outside(edges: EdgeSet, frame: SensorFrame, slack: float) -> mi.Float:
 def curve_weights(curves: CurveSet, frame: SensorFrame, border: int) -> mi.Float:
     """Relative sampling weight of every piece of an analytic curve [px]; detached."""
     row = dr.arange(mi.UInt32, dr.width(curves.rows.kind))
-    ends = [curve_row_point(curves, row, mi.Float(t), frame, mi.Point2f(LENS_CENTRE), mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
+    ends = [
+        curve_row_point(curves, row, mi.Float(t), frame, mi.Point2f(LENS_CENTRE), mi.Bool(True))
+        for t in (0.0, 0.5, 1.0)
+    ]
     (a, _, _), (middle, _, _), (b, _, _) = ends
     valid = a.view.valid | middle.view.valid | b.view.valid
     # A piece is an arc, not its chord: leave room for the sagitta.

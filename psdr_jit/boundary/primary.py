@@ -82,7 +82,9 @@ def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
     distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
     if distribution.total <= 0:
         return None
-    return PrimaryEdges(segments, curves, distribution, dr.width(weights[0]) if segments.rows is not None else 0)
+    return PrimaryEdges(
+        segments, curves, distribution, dr.width(weights[0]) if segments.rows is not None else 0
+    )
 
 
 @dataclass
@@ -102,7 +104,9 @@ def _edge_point(edges: PrimaryEdges, sample: EdgeSample, frame: SensorFrame) -> 
         point = segment_point(edges.segments, sample.row, sample.t, frame, sample.aperture, straight)
     if edges.curves.rows is not None:
         row = sample.row - edges.segment_count
-        on_curve, local, scale = curve_row_point(edges.curves, row, sample.t, frame, sample.aperture, ~straight)
+        on_curve, local, scale = curve_row_point(
+            edges.curves, row, sample.t, frame, sample.aperture, ~straight
+        )
         point = on_curve if point is None else dr.select(straight, point, on_curve)
     return _Seen(point, straight, local, scale)
 
@@ -180,7 +184,7 @@ def contribution(job: Job) -> mi.TensorXf | None:
             return None
         L, alpha, wavelengths = _both_sides(job, frame, edges, sample)
         even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
-        ΔL = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
+        ΔL = job.rejected.keep_finite(dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1))
         Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
         wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
         seen = _edge_point(edges, sample, frame)
@@ -200,7 +204,9 @@ def contribution(job: Job) -> mi.TensorXf | None:
             u = ray.o + ray.d * dr.detach(dr.dot(point.x - ray.o, ray.d))
             relative -= u - dr.detach(u)
         motion = dr.dot(point.side, relative) * scale
-        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
+        return films.develop_boundary(
+            job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid
+        )
 
 
 def forward(job: Job) -> mi.TensorXf:
