@@ -9,8 +9,8 @@ with v the material velocity of the surface and u_1 given by the attached camera
 parameterisation of [Zhang et al. 2020, §4, Eq. 14-17]; differentiating Mitsuba's ray-triangle intersection with an
 attached origin produces exactly this recursion. The contribution of vertex k then is
 
-    L_k = f(ω_y) · L_e(y→x_k) · G(x_k, y) |dA(y)/dA_0| / p                               (emitter point y: material form)
-        + w_k · L_{k+1},       w_k = f(ω_{k+1}) / p                                     (continuation: direction fixed)
+    L_k = f(ω_y) · L_e(y→x_k) · G(x_k, y) |dA(y)/dA_0| / p                             (emitter point y: material form)
+        + w_k · L_{k+1},       w_k = f(ω_{k+1}) / p                                   (continuation: direction fixed)
 
 Emission is in *material* form whether y was found by emitter or by BSDF sampling (both MIS partners estimate one
 integral, so they must move y alike): an area light's outline then is no discontinuity of this term. Infinitely

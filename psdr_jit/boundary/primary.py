@@ -7,8 +7,8 @@ from the sensor to it and s = τ×ω/|τ×ω| the direction across the edge, the
 
 L_∓ radiance on the side −s and +s, v_B the material velocity of the edge point, u that of the point at x_B's depth
 on the viewing ray of a *fixed* film position (camera motion), and J_px the area perpendicular to ω that one pixel sees
-there. It is [Zhang et al. 2020, Eq. 21] restricted to the first segment, or the edge integral of [Li et al. 2018, Eq. 5],
-written in world space: only x_B and the camera ray are attached, so pose, field of view, principal point,
+there. It is the boundary integral of [Zhang et al. 2020, Eq. 21] restricted to the first segment, or the edge integral
+of [Li et al. 2018, Eq. 5], written in world space: only x_B and the camera ray are attached, so pose, field of view, principal point,
 aperture and focus need no code of their own.
 
 The value of the estimator is 0, only its derivative is not. Both sides are traced with the same random numbers.

@@ -1,0 +1,76 @@
+"""What the subcommands share: argument types, progress on the terminal, Mitsuba's own chatter."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from psdr_jit.errors import OptionError
+
+PATIENCE = 2.0  # seconds before a progress bar appears
+
+
+def vector(text: str) -> tuple[float, float, float]:
+    """Parse `x,y,z`."""
+    try:
+        numbers = tuple(float(part) for part in text.replace(" ", ",").split(",") if part)
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3:
+        raise argparse.ArgumentTypeError(f"expected three numbers x,y,z, got '{text}'")
+    return numbers
+
+
+def require_positive(**options: float | None) -> None:
+    """Raise `OptionError` for each named option that is given and not greater than zero."""
+    for name, value in options.items():
+        if value is not None and not value > 0:
+            raise OptionError(f"--{name.replace('_', '-')} must be greater than 0, got {value}")
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """The scene and the options that every rendering command has."""
+    parser.add_argument("scene", metavar="SCENE.xml", help="Mitsuba scene file")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    parser.add_argument("-D", "--define", action="append", default=[], metavar="NAME=VALUE",
+                        help="override a <default> of the scene file; may be repeated")
+
+
+def definitions(args: argparse.Namespace) -> dict[str, str]:
+    """The -D options as a dictionary."""
+    for item in args.define:
+        if "=" not in item:
+            raise OptionError(f"-D {item}: expected NAME=VALUE")
+    return dict(item.split("=", 1) for item in args.define)
+
+
+@contextmanager
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, str], None]]:
+    """Yields `report(done, total, note)`. The bar goes to stderr, and only if the work takes a while."""
+    import time
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    start = time.perf_counter()
+    console = Console(file=sys.stderr)
+    columns = (TextColumn(label), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
+               TextColumn("{task.fields[note]}"))
+    bar = Progress(*columns, console=console, transient=not console.is_terminal)
+    task = bar.add_task(label, total=1.0, note="")
+    started = False
+
+    def report(done: float, total: float, note: str = "") -> None:
+        nonlocal started
+        if not quiet and not started and time.perf_counter() - start > PATIENCE:
+            bar.start()
+            started = True
+        bar.update(task, completed=min(1.0, done / total), note=note)
+
+    try:
+        yield report
+    finally:
+        if started:
+            bar.stop()

@@ -1,0 +1,112 @@
+"""Differentiate the image of a scene with respect to one of its parameters.
+
+Writes a multi-layer OpenEXR file (primal, total, each term, their standard errors) and a PNG beside it.
+With --check the derivative is compared with finite differences; the exit status is then 1 unless it passes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from psdr_jit.cli import _common
+
+NAME = "gradient"
+HELP = "differentiate a scene by one of its parameters"
+
+OK, CHECK_FAILED = 0, 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    _common.add_scene_arguments(parser)
+    parser.add_argument("--wrt", required=True, metavar="PARAM", help="parameter; 'psdr params' lists them")
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--direction", type=_common.vector, metavar="x,y,z",
+                     help="translation in world space, or one number per colour channel")
+    way.add_argument("--rotate", type=_common.vector, metavar="x,y,z",
+                     help="world axis through the shape's centre; the derivative is per radian")
+    way.add_argument("--index", type=int, metavar="I", help="one scalar of the parameter")
+    # argparse takes -1,0,0 for an option unless told that it is a number
+    parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,eE+-]*$")
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel, seed and term (default: 64)")
+    parser.add_argument("--seeds", type=int, default=8, help="independent images to average (default: 8)")
+    parser.add_argument("--max-depth", type=int, metavar="N", help="path length (default: the scene's own)")
+    parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    parser.add_argument("-o", "--output", metavar="FILE",
+                        help=".exr file (default: the scene's name with _gradient.exr, in this folder)")
+    parser.add_argument("--check", action="store_true", help="compare with finite differences as well")
+    parser.add_argument("--check-seconds", type=float, default=120, metavar="S",
+                        help="time limit of the check (default: 120)")
+    parser.add_argument("--integrator", help=argparse.SUPPRESS)
+    parser.add_argument("--quiet", action="store_true", help="print only errors and the check's verdict")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render, write, check; 0, or 1 for a check that did not pass."""
+    _common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
+                             check_seconds=args.check_seconds)
+    from psdr_jit import images, integrators, scene_io
+    from psdr_jit.gradient import gradient
+    from psdr_jit.perturbation import perturb
+
+    exr = images.check_writable(args.output or Path(args.scene).stem + "_gradient.exr").with_suffix(".exr")
+    png = images.check_writable(exr.with_suffix(".png"))
+    images.check_writable(exr)
+    scene_io.use_variant(args.variant)
+    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene_io.check_sensor(scene, args.sensor)
+    spec = integrator_of(args, scene)
+    parameter = perturb(scene, args.wrt, args.direction, rotate=args.rotate, index=args.index)
+    with _common.progress_bar("gradient", args.quiet) as report:
+        result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds,
+                          sensor=args.sensor, progress=report)
+    images.write_exr(exr, result.layers(), result.metadata())
+    title = f"d image / d {result.param}\n{result.direction}"
+    images.write_derivative_png(png, result.total, title)
+    if not args.quiet:
+        print(describe(result, exr, png))
+    return check(args, scene, parameter, integrators.integrator_spec(scene, spec)) if args.check else OK
+
+
+def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:
+    """The scene's own `psdr_path` with all its options, or ours with the scene's path lengths."""
+    from psdr_jit import integrators, scene_io
+
+    named = args.integrator or integrators.DEFAULT_INTEGRATOR
+    own = scene_io.integrator_properties(args.scene, **_common.definitions(args))
+    given: Mapping[str, Any] | str = own if own.get("type") == named else named
+    return integrators.integrator_spec(scene, given, max_depth=args.max_depth)
+
+
+def describe(result: Any, exr: Path, png: Path) -> str:
+    """What was computed, in a few lines."""
+    import numpy as np
+
+    def line(name: str, image: Any, stderr: Any) -> str:
+        return (f"  {name:9s} mean {image.mean(): .4e}   rms {np.sqrt((image**2).mean()):.4e}   "
+                f"rms standard error {np.sqrt((stderr**2).mean()):.1e}")
+
+    plugin = result.integrator["type"]
+    lines = [f"d image / d {result.param}, {result.direction}",
+             f"  {plugin}, {result.seeds} seeds x {result.spp} spp, {result.seconds:.1f} s",
+             line("total", result.total, result.total_stderr)]
+    lines += [line(k, v, result.term_stderr[k]) for k, v in result.terms.items()]
+    if result.rejected:
+        lines.append(f"  {result.rejected} samples were not finite and were dropped")
+    return "\n".join([*lines, f"wrote {exr} and {png}"])
+
+
+def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any]) -> int:
+    """Run the check and print its verdict."""
+    from psdr_jit.check import check_gradient
+
+    limit = args.check_seconds
+    with _common.progress_bar("check", args.quiet) as report:
+        result = check_gradient(
+            scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor, max_seconds=limit,
+            progress=lambda t, v: report(t, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}"))
+    print(result)
+    return OK if result.passed else CHECK_FAILED

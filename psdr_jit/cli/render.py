@@ -1,0 +1,48 @@
+"""Render a Mitsuba scene file, with the plugins of psdr_jit available to it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from psdr_jit.cli import _common
+from psdr_jit.errors import OptionError
+
+NAME = "render"
+HELP = "render a scene"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    _common.add_scene_arguments(parser)
+    parser.add_argument("-o", "--output", metavar="FILE",
+                        help=".exr or .png (default: the scene's name with .exr, in this folder)")
+    parser.add_argument("--spp", type=int, help="samples per pixel (default: the scene's own)")
+    parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render and write; 0."""
+    _common.require_positive(spp=args.spp)
+    from psdr_jit import images, scene_io
+
+    output = images.check_writable(args.output or Path(args.scene).with_suffix(".exr").name)
+    if output.suffix.lower() not in (".exr", ".png"):
+        raise OptionError(f"cannot write '{output}': the name must end in .exr or .png")
+    scene_io.use_variant(args.variant)
+    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene_io.check_sensor(scene, args.sensor)
+
+    import mitsuba as mi
+
+    from psdr_jit.integrators import to_image
+
+    image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))
+    if output.suffix.lower() == ".exr":
+        images.write_exr(output, {"primal": image})
+    else:
+        images.write_panels(output, [("primal", Path(args.scene).name, image)])
+    if not args.quiet:
+        print(f"wrote {output}")
+    return 0

@@ -1,0 +1,157 @@
+"""Image files: multi-layer OpenEXR for numbers, PNG with a diverging colour map for eyes.
+
+Files are written beside their destination and renamed, so a reader never meets half of one.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psdr_jit.errors import OptionError
+
+ROBUST_PERCENTILE = 99.0    # of |value| where not zero: the end of the colour scale
+COLOUR_MAP = "RdBu_r"       # red positive, blue negative, white zero
+CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+
+
+def check_writable(path: str | os.PathLike) -> Path:
+    """Raise `OptionError` if a file at `path` could not be written; call it before rendering."""
+    path = Path(path)
+    if path.is_dir():
+        raise OptionError(f"cannot write '{path}': it is a folder; name a file in it")
+    folder = path.parent
+    if not folder.is_dir():
+        raise OptionError(f"cannot write '{path}': the folder '{folder}' does not exist; create it first")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise OptionError(f"cannot write '{path}': the file is write-protected; choose another name")
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".psdr-"):
+            pass
+    except OSError as error:
+        cause = error.strerror or error
+        raise OptionError(f"cannot write '{path}': {cause}; choose another folder") from error
+    return path
+
+
+def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray],
+              metadata: Mapping[str, str] | None = None) -> Path:
+    """Write images (H, W, C) as layers of one 32-bit float OpenEXR file.
+
+    The first layer is also the default one (plain R, G, B), so that every viewer shows something. Layer
+    `total` has the channels `total.R`, `total.G`, `total.B`. `metadata` goes into the header.
+    """
+    import OpenEXR
+
+    if not layers:
+        raise OptionError("an OpenEXR file needs at least one layer")
+    channels: dict[str, np.ndarray] = {}
+    for k, (name, image) in enumerate(layers.items()):
+        for prefix in ("", f"{name}.") if k == 0 else (f"{name}.",):
+            channels.update(_channels(prefix, image))
+    sizes = {c.shape for c in channels.values()}
+    if len(sizes) > 1:
+        raise OptionError(f"the layers of an image must have one size, got {sorted(sizes)}")
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header.update({f"psdr_{k}": str(v) for k, v in (metadata or {}).items()})
+
+    def write(temporary: str) -> None:
+        with OpenEXR.File(header, channels) as file:
+            file.write(temporary)
+
+    return _atomically(path, write)
+
+
+def _channels(prefix: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    image = np.asarray(image, dtype=np.float32)
+    image = image if image.ndim == 3 else image[..., None]
+    names = CHANNELS.get(image.shape[-1], tuple(f"C{k}" for k in range(image.shape[-1])))
+    return {prefix + c: np.ascontiguousarray(image[..., k]) for k, c in enumerate(names)}
+
+
+def read_exr(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All channels of an OpenEXR file as float32 arrays (H, W), by full name such as `total.R`."""
+    import OpenEXR
+
+    with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+        return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+
+
+def write_derivative_png(path: str | os.PathLike, image: np.ndarray, title: str = "",
+                         unit: str = "radiance per unit") -> Path:
+    """Write one derivative image (H, W, C) in red (positive) and blue (negative) with a colour bar."""
+    return write_panels(path, [("derivative", title, image)], unit)
+
+
+def write_panels(path: str | os.PathLike, panels: Sequence[tuple[str, str, np.ndarray]],
+                 unit: str = "radiance per unit") -> Path:
+    """Write images side by side: each panel is (kind, title, image), kind `primal` or `derivative`.
+
+    Derivatives show the mean of their channels; all of them share one symmetric scale, set by a percentile
+    so that a few noisy pixels do not wash out the rest.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    derivatives = [_grey(image) for kind, _, image in panels if kind == "derivative"]
+    limit = robust_limit(derivatives) if derivatives else 1.0
+    # Figure instead of pyplot: no global state, no display
+    figure = Figure(figsize=(3.6 * len(panels) + 0.9, 3.9), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    shown = None
+    for axis, (kind, title, image) in zip(axes, panels, strict=True):
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+        if kind == "primal":
+            axis.imshow(srgb(image), interpolation="nearest")
+        else:
+            shown = axis.imshow(_grey(image), cmap=COLOUR_MAP, vmin=-limit, vmax=limit,
+                                interpolation="nearest")
+    if shown is not None:
+        derivative_axes = [a for a, p in zip(axes, panels, strict=True) if p[0] == "derivative"]
+        figure.colorbar(shown, ax=derivative_axes, label=unit, shrink=0.85)
+    return _atomically(path, lambda temporary: figure.savefig(temporary, format="png"))
+
+
+def robust_limit(images: Sequence[np.ndarray]) -> float:
+    """Largest value of a symmetric colour scale: a percentile of the non-zero magnitudes, 1 if all vanish."""
+    values = np.concatenate([np.abs(np.asarray(i)).ravel() for i in images])
+    values = values[np.isfinite(values) & (values > 0)]
+    return float(np.percentile(values, ROBUST_PERCENTILE)) if values.size else 1.0
+
+
+def srgb(image: np.ndarray) -> np.ndarray:
+    """Linear radiance (H, W, C) to display values in [0, 1] (H, W, 3)."""
+    image = np.asarray(image, dtype=np.float64)
+    image = np.repeat(image[..., :1], 3, axis=-1) if image.shape[-1] < 3 else image[..., :3]
+    image = np.clip(np.nan_to_num(image), 0, 1)
+    return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image, dtype=np.float64)
+    return image if image.ndim == 2 else image[..., : min(3, image.shape[-1])].mean(-1)
+
+
+def _atomically(path: str | os.PathLike, write: Callable[[str], None]) -> Path:
+    """Let `write` fill a temporary file in the same folder, then rename it; nothing is left on failure."""
+    path = check_writable(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".psdr-", suffix=path.suffix)
+    os.close(handle)
+    try:
+        write(temporary)
+        # mkstemp files are private; give this one the mode any new file would have
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+    return path

@@ -1,0 +1,26 @@
+"""Non-finite samples are dropped, and counted: a NaN masked in silence would be a defect."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+
+class Rejected:
+    """Counter of dropped samples. Lives on an integrator, reads as an `int`, costs no synchronisation until then."""
+
+    def __init__(self):
+        self._count = mi.UInt32(0)
+
+    def keep_finite(self, value: mi.Spectrum) -> mi.Spectrum:
+        """`value` with 0 in lanes where any component is NaN or infinite; those lanes are counted. Detached."""
+        sound = dr.all(dr.isfinite(value))
+        self._count += dr.sum(dr.select(sound, mi.UInt32(0), 1))
+        dr.schedule(self._count)
+        return dr.select(sound, value, 0)
+
+    def __int__(self) -> int:
+        return int(self._count[0])
+
+    def clear(self) -> None:
+        self._count = mi.UInt32(0)

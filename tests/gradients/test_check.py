@@ -1,0 +1,157 @@
+"""The check has to be able to fail: synthetic images with a known answer, then one scene end to end."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from psdr_jit import scene_io
+from psdr_jit.check import FAIL, INCONCLUSIVE, PASS, check_gradient, judge
+from psdr_jit.finite_differences import CentralDifference
+from psdr_jit.perturbation import perturb
+from psdr_jit.statistics import GroupedImages, block_means, block_test, gain
+
+SHAPE = (32, 32, 3)
+SEEDS = 64
+BLOCK = 2
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """A derivative as an edge makes it: zero but for two stripes of opposite sign."""
+    image = np.zeros(SHAPE)
+    image[4:28, 8] = 3.0
+    image[4:28, 20] = -2.0
+    return image
+
+
+def collect(mean, noise, seed, seeds=SEEDS):
+    """Images of independent seeds with uniform Gaussian noise of standard deviation `noise`."""
+    rng = np.random.default_rng(seed)
+    images = GroupedImages()
+    for _ in range(seeds):
+        images.add(mean + noise * rng.normal(size=SHAPE))
+    return images
+
+
+def verdict(d, truth, reference_noise=1.0, **options):
+    return judge(d, collect(truth, reference_noise, 1), collect(truth, reference_noise, 2), BLOCK, **options)
+
+
+def test_the_truth_passes(truth):
+    v = verdict(collect(truth, 1.0, 3), truth)
+    assert v.verdict == PASS, v
+    assert abs(v.gain - 1) < 4 * v.gain_stderr < 0.03
+
+
+@pytest.mark.parametrize("factor, noise", [(0, 0), (0, 1), (-1, 1), (0.5, 1), (0.95, 1), (1.05, 1), (2, 1)])
+def test_wrong_scale_fails(truth, factor, noise):
+    v = verdict(collect(factor * truth, noise, 3), truth)
+    assert v.verdict == FAIL, v
+    assert abs(v.gain - factor) < 0.02
+
+
+def test_right_gain_at_the_wrong_place_fails(truth):
+    """A missing term orthogonal to the reference leaves the gain at 1; the blocks give it away."""
+    wrong = truth.copy()
+    wrong[28:, 12:18] = 1.0
+    v = verdict(collect(wrong, 1.0, 3), truth)
+    assert abs(v.gain - 1) < 0.02 and v.verdict == FAIL, v
+
+
+def test_understated_errors_fail(truth):
+    """Every seed shares one error that its scatter does not show."""
+    hidden = 0.25 * np.random.default_rng(5).normal(size=SHAPE)
+    v = verdict(collect(truth + hidden, 1.0, 3), truth)
+    assert v.verdict == FAIL and "RMS z" in v.reason or "standard errors" in v.reason, v
+
+
+def test_too_noisy_is_inconclusive(truth):
+    v = verdict(collect(truth, 20.0, 3), truth)
+    assert v.verdict == INCONCLUSIVE and "standard error of the gain" in v.reason, v
+
+
+def test_too_few_seeds_are_inconclusive(truth):
+    v = verdict(collect(truth, 1.0, 3, seeds=16), truth)
+    assert v.verdict == INCONCLUSIVE and "seeds" in v.reason
+
+
+def test_gain_is_not_biased_by_a_noisy_reference(truth):
+    """d.f / f.f with one reference of this noise would give about 0.5; two halves give 1 within the error."""
+    d, noise = collect(truth, 0.0, 3).group_means(), 10.0
+    slopes = [gain(d, collect(truth, noise, 10 + k, 32).group_means(),
+                   collect(truth, noise, 90 + k, 32).group_means()) for k in range(24)]
+    values = np.array([s.value for s in slopes])
+    f = collect(truth, noise, 1, 32).mean()
+    assert np.sum(truth * f) / np.sum(f * f) < 0.6
+    assert abs(values.mean() - 1) < 4 * values.std() / np.sqrt(24)
+    # and the jackknife error is that of repeated experiments
+    assert 0.7 < np.mean([s.stderr for s in slopes]) / values.std(ddof=1) < 1.4
+
+
+def test_zero_gradient_needs_an_absolute_bound():
+    zero = np.zeros(SHAPE)
+    d, f1, f2 = (collect(zero, 1.0, k) for k in (3, 1, 2))
+    assert judge(d, f1, f2, BLOCK).verdict == INCONCLUSIVE
+    assert judge(d, f1, f2, BLOCK, zero_bound=1.0).verdict == PASS
+    assert judge(d, f1, f2, BLOCK, zero_bound=0.1).verdict == INCONCLUSIVE
+    assert judge(collect(zero + 3, 1.0, 3), f1, f2, BLOCK, zero_bound=1.0).verdict == FAIL
+    assert judge(collect(zero + 3, 1.0, 3), f1, f2, BLOCK).verdict == FAIL
+    exact = [collect(zero, 0.0, k) for k in range(3)]
+    assert judge(*exact, BLOCK).verdict == PASS
+
+
+def test_block_means_of_odd_sizes():
+    image = np.arange(5 * 7 * 1.0).reshape(5, 7, 1)
+    blocks = block_means(image, 4)
+    assert blocks.shape == (2, 2, 1)
+    assert blocks[0, 0, 0] == image[:4, :4].mean() and blocks[1, 1, 0] == image[4:, 4:].mean()
+
+
+def test_z_scores_of_honest_errors_are_standard_normal(truth):
+    d = collect(truth, 1.0, 3).group_means()
+    f = collect(truth, 2.0, 4).group_means()
+    test = block_test(d, f, BLOCK)
+    assert 0.9 < test.rms_z < 1.15 and test.max_z < 5 and test.blocks == 16 * 16 * 3
+
+
+@pytest.fixture(scope="module")
+def card():
+    scene_io.use_variant("llvm_ad_rgb")
+    return scene_io.load_scene(scene_io.shipped_scene("emissive_card.xml"))
+
+
+@pytest.mark.parametrize("how", [dict(direction=(1, 0, 0)), dict(rotate=(0, 0, 1))])
+def test_moving_card_passes(card, how):
+    """Primary boundary alone; oracle: finite differences of `path`."""
+    result = check_gradient(card, "card.vertex_positions", integrator="psdr_path", max_seconds=20, **how)
+    assert result.passed, str(result)
+
+
+def test_mitsuba_prb_fails_on_the_moving_card(card):
+    """prb has no boundary term: its derivative is 0 and the check says so."""
+    mi.set_log_level(mi.LogLevel.Error)
+    result = check_gradient(card, "card.vertex_positions", (1, 0, 0), integrator="prb", max_seconds=20)
+    assert result.verdict.verdict == FAIL and abs(result.verdict.gain) < 0.01, str(result)
+
+
+def test_radiance_passes_and_is_restored(card):
+    """Linear in the parameter: no boundary term, and almost no noise, so rounding must not count as error."""
+    before = np.array(mi.traverse(card)["card.emitter.radiance.value"])
+    result = check_gradient(card, "card.emitter.radiance.value", integrator="prb", max_seconds=20)
+    assert result.passed, str(result)
+    assert np.array_equal(np.array(mi.traverse(card)["card.emitter.radiance.value"]), before)
+
+
+def test_a_change_that_no_sample_met_has_an_error(card):
+    """Few samples, a tiny step: blocks at the outline show no scatter, which is not certainty."""
+    spec = {"type": "path", "max_depth": 2}
+    difference = CentralDifference(perturb(card, "card.vertex_positions", index=0), spec, spp=4, eps=1e-4)
+    difference.add(2)
+    still = block_means(difference.primal.mean(), BLOCK) > 0
+    floor = difference.floor(BLOCK)
+    one_sample = 0.6 / (2 * 1e-4 * 4 * BLOCK**2 * 4)     # the darkest channel, brightest neighbour
+    unseen = still & (block_means(difference.result(BLOCK).mean, BLOCK) == 0)
+    assert unseen.sum() > 100 and np.all(floor[unseen] > 0.5 * one_sample)
+    assert np.all(floor[0] == 0), "black far from the card: anything there would be an error"
