@@ -56,7 +56,7 @@ class CurvePoint:
 
     x: mi.Point3f
     dx_ds: mi.Vector3f
-    outward: mi.Vector3f  # a local direction that leads away from the shape
+    outward: mi.Vector3f  # a local direction that leads off the surface, across the curve
     valid: mi.Bool  # the silhouette exists (the viewpoint is outside)
 
 
@@ -102,13 +102,28 @@ def local_viewpoint(columns: tuple[mi.Vector3f, ...], view: mi.Vector4f) -> mi.V
     return mi.Vector4f(x * inv_det, y * inv_det, z * inv_det, view.w)
 
 
+def curve_centre(kind: mi.UInt32) -> mi.Point3f:
+    """A local point inside the shape, from which its contour always exists."""
+    on_axis = (kind >= int(Curve.CYLINDER_BOTTOM)) & (kind <= int(Curve.CYLINDER_RIGHT))
+    return mi.Point3f(0, 0, dr.select(on_axis, 0.5, 0.0))
+
+
+def curve_lengths(curves: CurveSet) -> mi.Float:
+    """Approximate length of every piece [m] (a contour's depends on the viewpoint); detached."""
+    columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, curves.rows.shape))
+    line = (curves.rows.kind == int(Curve.CYLINDER_LEFT)) | (curves.rows.kind == int(Curve.CYLINDER_RIGHT))
+    round_trip = dr.pi * (dr.norm(columns[0]) + dr.norm(columns[1]))
+    return dr.select(line, dr.norm(columns[2]), round_trip) / PIECES
+
+
 def curve_point(kind: mi.UInt32, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
     """Evaluate curve `kind` at parameter `s` for the local viewpoint `view`. Detached, branch-free."""
     sin, cos = dr.sincos(dr.two_pi * s)
     rim_z = dr.select(kind == int(Curve.CYLINDER_TOP), 1.0, 0.0)
     x = mi.Point3f(cos, sin, rim_z)
     dx = dr.two_pi * mi.Vector3f(-sin, cos, 0)
-    outward = mi.Vector3f(cos, sin, 0)
+    tube_end = (kind == int(Curve.CYLINDER_BOTTOM)) | (kind == int(Curve.CYLINDER_TOP))
+    outward = dr.select(tube_end, mi.Vector3f(0, 0, 2 * rim_z - 1), mi.Vector3f(cos, sin, 0))
     valid = mi.Bool(True)
 
     left, right = kind == int(Curve.CYLINDER_LEFT), kind == int(Curve.CYLINDER_RIGHT)

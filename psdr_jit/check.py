@@ -10,14 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from psdr_jit import integrators
 from psdr_jit.errors import OptionError
 from psdr_jit.finite_differences import CentralDifference, default_block
-from psdr_jit.gradient import DerivativeSampler
+from psdr_jit.gradient import DerivativeSampler, differentiable
+from psdr_jit.options import require_count
 from psdr_jit.perturbation import Perturbation, perturb
 from psdr_jit.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
 
@@ -150,8 +153,9 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
 
     `progress(seconds, verdict)` is called after every batch of seeds.
     """
-    if spp <= 0 or max_seconds <= 0:
-        raise OptionError(f"spp and max_seconds must be positive, got {spp} and {max_seconds}")
+    _require_sane(sensor, counts=dict(spp=spp, reference_spp=reference_spp, block=block),
+                  reals=dict(eps=eps, max_seconds=max_seconds, tolerance=tolerance, max_stderr=max_stderr,
+                             zero_bound=zero_bound))
     if not isinstance(param, Perturbation):
         param = perturb(scene, param, direction, rotate=rotate, index=index)
     if hasattr(integrator, "render_forward"):
@@ -159,7 +163,7 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
         terms: list[str] = []
     else:
         spec = integrators.integrator_spec(scene, integrator)
-        tested, terms = integrators.build(spec), integrators.terms_of(spec)
+        tested, terms = differentiable(spec), integrators.terms_of(spec)
     start = time.perf_counter()
     estimate = DerivativeSampler(param, tested, sensor, spp)
     reference = CentralDifference(param, spec, sensor, reference_spp, eps)
@@ -183,6 +187,18 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
                        param.name, param.label, estimate.images.mean(), reference.result(block).mean)
 
 
+def _require_sane(sensor: Any, counts: dict[str, Any], reals: dict[str, Any]) -> None:
+    """Raise `OptionError` for what is given (not None) and not a positive number."""
+    for name, value in counts.items():
+        if value is not None:
+            require_count(name, value)
+    for name, value in {**counts, **reals}.items():
+        if value is not None and not (isinstance(value, Real) and value > 0):
+            raise OptionError(f"{name} must be a positive number, got {value!r}")
+    if isinstance(sensor, mi.Sensor):
+        raise OptionError("sensor must be an index: the finite differences render the scene's own sensors")
+
+
 def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: int | None, start: float,
              deadline: float, progress: Any, rule: dict[str, Any]) -> tuple[Verdict, int]:
     """Add seeds until `judge` decides or the deadline has passed."""
@@ -190,7 +206,10 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
         # two are needed for any statement at all, the rest only while there is time
         while sampler.seeds < 2 or (sampler.seeds < MIN_SEEDS and time.perf_counter() < deadline):
             sampler.add(2)
-    block = block or default_block(estimate.images.mean().shape)
+    size = estimate.images.mean().shape
+    if block is not None and block > min(size[:2]):
+        raise OptionError(f"block = {block} is larger than the image, {size[1]} x {size[0]} px")
+    block = block or default_block(size)
     f1, f2 = reference.halves
     while True:
         verdict = judge(estimate.images, f1, f2, block, floor=reference.floor(block), **rule)

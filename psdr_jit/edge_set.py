@@ -16,12 +16,17 @@ import numpy as np
 from .compat import mesh_faces, mesh_positions
 from .edge_geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .mesh_edges import WELD_TOLERANCE, build_edge_topology, weld_vertices
+from .mesh_shells import edge_shells
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
 
 #: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
 SEAM_TOLERANCE = 1e-4
+
+
+#: Coinciding edges are looked for among all edges up to this many, among borders only beyond (a cost per call).
+MAX_COMPARED_EDGES = 20000
 
 
 @dataclass
@@ -37,6 +42,7 @@ class EdgeRows:
     angle: mi.Float  # exterior angle [rad]
     border: mi.Bool
     seam: mi.Bool  # what the faces reflect may differ along the edge even where both are visible
+    traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
     shell: mi.Float  # +1: closed surface, normals outward; −1: inward; 0: open, both sides can be seen
     shape0: mi.UInt32  # index into the edge set's meshes, of the first face ...
     shape1: mi.UInt32  # ... and of the second
@@ -53,7 +59,7 @@ class _MeshTopology:
     faces: mi.UInt32  # kept alive, so that its index identifies it
     vertices: int
     device: EdgeTopologyDevice
-    closed: bool
+    shell: mi.Float  # per edge, see EdgeRows
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,7 @@ class EdgeSet:
 def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict) -> EdgeSet:
     """Edges of `meshes` in their present state; topologies are kept in `cache` from call to call.
 
-    Borders of two shapes that coincide (walls of a room) are one discontinuity and become one row, provided that
-    both shapes move or neither does (`moving`): otherwise the row belongs to the shape that moves.
+    Coinciding edges of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
@@ -81,7 +86,7 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict) -> EdgeSet:
         topology = _cached_topology(mesh, positions, faces, cache)
         parts.append(_rows(mesh, positions, faces, topology, i, first_vertex))
         first_vertex += dr.width(positions)
-    rows = parts[0] if len(parts) == 1 else join_borders(_concatenate(parts), moving)
+    rows = join_coinciding(parts[0] if len(parts) == 1 else _concatenate(parts), moving)
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
     dr.eval(rows)
     return EdgeSet(tuple(meshes), rows, shapes)
@@ -113,10 +118,12 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dic
         return known
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
-    closed = bool(not topology.border.any() and topology.nonmanifold_edges == 0 and len(topology) > 0)
-    device = upload_topology(topology)
-    closed = closed and bool(dr.all(device.opposed))
-    cache[key] = _MeshTopology(buffer, dr.width(positions), device, closed)
+    from .scene_checks import warn_about_mesh  # not at the top: the checks stand above the edge sets
+
+    warn_about_mesh(mesh.id(), topology)
+    cache[key] = _MeshTopology(
+        buffer, dr.width(positions), upload_topology(topology), mi.Float(edge_shells(topology, p, f))
+    )
     return cache[key]
 
 
@@ -151,22 +158,10 @@ def _is_seam(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice, angle: mi.Float
         seam |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
     bsdf = mesh.bsdf()
     textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    textured |= mesh.emitter() is not None and mi.has_flag(
-        mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying
-    )
+    textured |= mesh.emitter() is not None and mi.has_flag(mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying)
     if textured and mesh.has_vertex_texcoords():
         seam |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
     return seam
-
-
-def _shell(positions: mi.Point3f, faces: mi.Vector3u, closed: bool) -> float:
-    """+1 if the closed surface's normals point outward (positive signed volume), −1 inward, 0 if it is open."""
-    if not closed:
-        return 0.0
-    a, b, c = (dr.gather(mi.Point3f, positions, index) for index in (faces.x, faces.y, faces.z))
-    centre = dr.mean(positions, axis=1)
-    volume = dr.sum(dr.dot(a - centre, dr.cross(b - centre, c - centre)))
-    return 1.0 if float(volume[0]) > 0 else -1.0
 
 
 def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_vertex: int) -> EdgeRows:
@@ -183,7 +178,8 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         angle=g.angle,
         border=topo.border,
         seam=_is_seam(mesh, faces, topo, g.angle),
-        shell=dr.full(mi.Float, _shell(positions, faces, topology.closed), n),
+        traced=dr.full(mi.Bool, False, n),
+        shell=topology.shell,
         shape0=dr.full(mi.UInt32, shape, n),
         shape1=dr.full(mi.UInt32, shape, n),
         prim0=topo.f0,
@@ -206,39 +202,57 @@ def _concatenate(parts: list[EdgeRows]) -> EdgeRows:
     return EdgeRows(**{name: join([getattr(part, name) for part in parts]) for name in fields})
 
 
-def join_borders(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
-    """Merge coinciding border edges of different shapes into two-faced edges (the second row is dropped)."""
-    border = np.flatnonzero(np.array(rows.border))
-    if len(border) < 2:
-        return rows
-    ends = [np.array(dr.gather(mi.Point3f, p, mi.UInt32(border))).T for p in (rows.p0, rows.p1)]
-    vertex = weld_vertices(np.concatenate(ends)).reshape(2, -1)
-    start, end = vertex
-    key = np.minimum(start, end) * (vertex.max() + 1) + np.maximum(start, end)
-    order = np.argsort(key, kind="stable")
-    _, first, count = np.unique(key[order], return_index=True, return_counts=True)
-    first = first[count == 2]
-    a, b = order[first], order[first + 1]
-    motion = np.array(moving)[np.array(rows.shape0)[border]]
-    same = motion[a] == motion[b]
-    a, b = a[same], b[same]
-    if len(a) == 0:
-        return rows
-    keep_a, drop_b, parallel = mi.UInt32(border[a]), mi.UInt32(border[b]), mi.Bool(start[a] == start[b])
+def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
+    """Edges at the same place are one discontinuity and become one row.
 
-    def of_b(values):
-        return dr.gather(type(values), values, drop_b)
+    Two borders become an edge with two faces. More than two, or an edge on an edge (stacked boxes), keep one row whose
+    sides are found by tracing rays, because topology no longer says which face is on top. Rows of a moving and of a
+    static shape are left apart: their motion relative to each other is what counts.
+    """
+    border = np.array(rows.border)
+    few = len(border) <= MAX_COMPARED_EDGES
+    candidate = np.arange(len(border)) if few else np.flatnonzero(border)
+    if len(candidate) < 2:
+        return rows
+    group = _coinciding(rows, candidate, np.array(moving)[np.array(rows.shape0)[candidate]])
+    if len(group) == 0:
+        return rows
+    pairs = [g for g in group if len(g) == 2 and border[g].all()]
+    others = [g for g in group if not (len(g) == 2 and border[g].all())]
+    if pairs:
+        _join_borders(rows, np.array(pairs))
+    for g in others:
+        dr.scatter(rows.traced, mi.Bool(True), mi.UInt32(g[:1]))
+    keep = np.ones(len(border), bool)
+    for g in group:
+        keep[g[1:]] = False
+    return dr.gather(EdgeRows, rows, mi.UInt32(np.flatnonzero(keep)))
+
+
+def _coinciding(rows: EdgeRows, candidate: np.ndarray, motion: np.ndarray) -> list[np.ndarray]:
+    """Groups of two or more rows with the same end points and the same entry in `motion`."""
+    ends = [np.array(dr.gather(mi.Point3f, p, mi.UInt32(candidate))).T for p in (rows.p0, rows.p1)]
+    start, end = weld_vertices(np.concatenate(ends)).reshape(2, -1)
+    count = max(start.max(), end.max()) + 1
+    key = (np.minimum(start, end) * count + np.maximum(start, end)) * 2 + motion
+    order = np.argsort(key, kind="stable")
+    _, first, length = np.unique(key[order], return_index=True, return_counts=True)
+    return [candidate[order[i : i + n]] for i, n in zip(first[length > 1], length[length > 1], strict=True)]
+
+
+def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
+    """Give the first border of every pair the second one's face, in place."""
+    a, b = mi.UInt32(pairs[:, 0]), mi.UInt32(pairs[:, 1])
+
+    def of(values, index):
+        return dr.gather(type(values), values, index)
 
     # Seen from face a, face b continues the surface if it runs along the edge the other way round.
-    n1, corner1 = of_b(rows.n0), of_b(rows.corner0)
-    dr.scatter(rows.n1, dr.select(parallel, -n1, n1), keep_a)
-    corner1 = dr.select(parallel, corner1, mi.Vector2u(corner1.y, corner1.x))
-    dr.scatter(rows.corner1, corner1, keep_a)
-    dr.scatter(rows.prim1, of_b(rows.prim0), keep_a)
-    dr.scatter(rows.shape1, of_b(rows.shape0), keep_a)
-    dr.scatter(rows.border, mi.Bool(False), keep_a)
-    dr.scatter(rows.seam, mi.Bool(True), keep_a)
-    keep = np.ones(dr.width(rows.border), bool)
-    keep[border[b]] = False
-    kept = mi.UInt32(np.flatnonzero(keep))
-    return dr.gather(EdgeRows, rows, kept)
+    parallel = dr.dot(of(rows.p1, a) - of(rows.p0, a), of(rows.p1, b) - of(rows.p0, b)) > 0
+    n1, corner1 = of(rows.n0, b), of(rows.corner0, b)
+    dr.scatter(rows.n1, dr.select(parallel, -n1, n1), a)
+    dr.scatter(rows.corner1, dr.select(parallel, corner1, mi.Vector2u(corner1.y, corner1.x)), a)
+    dr.scatter(rows.prim1, of(rows.prim0, b), a)
+    dr.scatter(rows.shape1, of(rows.shape0, b), a)
+    dr.scatter(rows.border, mi.Bool(False), a)
+    dr.scatter(rows.seam, mi.Bool(True), a)

@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from psdr_jit import integrators
 from psdr_jit.errors import OptionError
+from psdr_jit.options import require_count
 from psdr_jit.perturbation import Perturbation, perturb
+from psdr_jit.scene_io import find_sensor
 from psdr_jit.statistics import GroupedImages
 
 MAX_GROUPS = 64     # images kept for the standard errors; more seeds share a group
@@ -54,11 +57,11 @@ class GradientResult:
 class DerivativeSampler:
     """Adds independent seeds to a derivative image, as many as one asks for."""
 
-    def __init__(self, perturbation: Perturbation, integrator: Any, sensor: int = 0, spp: int = 64,
+    def __init__(self, perturbation: Perturbation, integrator: Any, sensor: Any = 0, spp: int = 64,
                  groups: int = 32, first_seed: int = 0) -> None:
         self.perturbation = perturbation
         self.integrator = integrator
-        self.sensor = perturbation.scene.sensors()[sensor]
+        self.sensor = find_sensor(perturbation.scene, sensor)
         self.spp = spp
         self.images = GroupedImages(groups)
         self.not_finite = 0     # pixel values that arrived as NaN or inf
@@ -101,10 +104,13 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
     Every one of the `seeds` is an independent image with `spp` samples per pixel and term; the standard
     errors come from their scatter. The scene is left as it was found.
     """
+    require_count("spp", spp)
+    require_count("seeds", seeds)
     if spp <= 0 or seeds <= 0:
         raise OptionError(f"spp and seeds must be positive, got spp={spp}, seeds={seeds}")
     if not isinstance(param, Perturbation):
         param = perturb(scene, param, direction, rotate=rotate, index=index)
+    view = find_sensor(scene, sensor)
     start = time.perf_counter()
     samplers, primal_integrator, spec = _samplers(scene, param, integrator, sensor, spp,
                                                  min(seeds, MAX_GROUPS))
@@ -112,7 +118,7 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
     try:
         for seed in range(seeds):
             with dr.suspend_grad():
-                image = primal_integrator.render(scene, scene.sensors()[sensor], seed=seed, spp=spp)
+                image = primal_integrator.render(scene, view, seed=seed, spp=spp)
             primal.add(integrators.to_image(image))
             images = [s.render(seed) for s in samplers.values()]
             for s, image in zip(samplers.values(), images, strict=True):
@@ -140,13 +146,24 @@ def _samplers(scene: Any, param: Perturbation, integrator: Any, sensor: int, spp
         spec = {"type": str(integrator).split("[")[0], **integrators.path_options(integrator)}
         return {"total": DerivativeSampler(param, integrator, sensor, spp, groups)}, integrator, spec
     spec = integrators.integrator_spec(scene, integrator)
-    whole = integrators.build(spec)
+    whole = differentiable(spec)
     terms = integrators.terms_of(spec)
     if not terms:
         return {"total": DerivativeSampler(param, whole, sensor, spp, groups)}, whole, spec
     samplers = {t: DerivativeSampler(param, integrators.build_term(spec, t), sensor, spp, groups)
                 for t in terms}
+    for sampler in samplers.values():
+        if hasattr(whole, "cache"):
+            sampler.integrator.cache = whole.cache      # edge tables, and what has been warned about
     return samplers, whole, spec
+
+
+def differentiable(spec: dict[str, Any]) -> Any:
+    """Instantiate `spec`, which must be an integrator."""
+    built = integrators.build(spec)
+    if not isinstance(built, mi.Integrator):
+        raise OptionError(f"'{spec['type']}' is a {type(built).__name__}, not an integrator")
+    return built
 
 
 def _report_not_finite(samplers: dict[str, DerivativeSampler]) -> int:

@@ -57,18 +57,29 @@ def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPt
     emitter is infinitely distant and its direction stays as it is.
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
-    si = hit.intersection().compute_surface_interaction(
-        ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active
-    )
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
     ω = mi.Vector3f(hit.d)
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
-    area = dr.norm(dr.cross(si.dp_du, si.dp_dv))  # at fixed (u, v): |dA| up to a constant
+    area = _area_element(si, on_surface)
     measure = dr.abs_dot(si.n, ω) / dist2 * area
     value = emitter.eval(si, active) * dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
     return ω, value
+
+
+def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+    """|dA| of a material point up to a constant factor, attached.
+
+    Meshes: area of the triangle. Their dp_du, dp_dv will not do, a degenerate texture map replaces them by a unit frame.
+    """
+    area = dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    on_mesh = active & si.shape.is_mesh()
+    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, dr.reinterpret_array(mi.UInt32, si.shape), 0))
+    corners = mesh.face_indices(si.prim_index, on_mesh)
+    p0, p1, p2 = (mesh.vertex_position(corners[i], on_mesh) for i in range(3))
+    return dr.select(on_mesh, dr.norm(dr.cross(p1 - p0, p2 - p0)), area)
 
 
 def _next_event(si, bsdf, nee, traits: SceneTraits):
@@ -85,9 +96,7 @@ def _next_event(si, bsdf, nee, traits: SceneTraits):
     return dr.select(active, f * value * nee.weight, 0)
 
 
-def vertex_terms(
-    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits
-):
+def vertex_terms(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits):
     """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
     ctx = mi.BSDFContext()
     si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)

@@ -6,7 +6,7 @@ a cheap first walk without shadow rays finds those paths and only they are recor
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from . import film as films
 from .interior import SceneTraits, backward_sweep, forward_sweep
 from .job import Job
 from .path_records import PathRecords
-from .path_steps import PathLimits, first_hit, walk
+from .path_steps import first_hit, walk
 from .scene_analysis import SceneFacts
 from .streams import Stream, lane_sampler, stream_seed
 from .touch import count_vertices, touches
@@ -47,7 +47,7 @@ def _passes(job: Job):
     done = 0
     while done < job.spp:
         spp = min(per_pass, job.spp - done)
-        seed = stream_seed(mi.UInt32(job.seed) + done, Stream.CAMERA)
+        seed = mi.sample_tea_32(stream_seed(job.seed, Stream.CAMERA), mi.UInt32(done))[0]
         sampler, actual = job.integrator.prepare(job.sensor, seed, spp, [])
         ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
         yield _Pass(actual, spp / job.spp, stream_seed(seed, Stream.INTERIOR), ray, weight, pos)
@@ -57,7 +57,7 @@ def _passes(job: Job):
 def every_path_differs(facts: SceneFacts) -> bool:
     """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
     emission = any(e.pose or e.radiance for e in facts.emitters)
-    moving_lights = any(s.is_emitter and s.geometry for s in facts.shapes)
+    moving_lights = any(s.is_emitter and (s.geometry or s.shading) for s in facts.shapes)
     return facts.camera_moves or emission or moving_lights
 
 
@@ -73,15 +73,17 @@ def touch_table(job: Job) -> mi.UInt32:
 
 def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
-    limits, facts = job.limits, job.facts
+    facts = job.facts
+    # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
+    limits = replace(job.limits, end_black=not any(s.material for s in facts.shapes))
+    if limits.max_depth == 0:
+        return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
     lane = dr.arange(mi.UInt32, dr.width(p.pos))
     dr.eval(ray, lane)
 
     if not every_path_differs(facts):
-        found = touches(
-            job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job)
-        )
+        found = touches(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
         if dr.width(lane) == 0:
             return PathRecords(0, 0), lane
@@ -94,7 +96,7 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
     sampler = lane_sampler(p.seed, lane)
     _, records.count, _ = walk(
-        job.scene, sampler, ray, pi, PathLimits(depth, limits.rr_depth), records, emission, mi.Bool(True)
+        job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
     records.wavelengths = ray.wavelengths
     dr.eval(records.count, records.vertices)
@@ -129,12 +131,8 @@ def forward(job: Job) -> mi.TensorXf:
                 recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job.facts))
                 recorded = job.rejected.keep_finite(recorded)
                 dr.scatter(dL, recorded, lane)
-                dr.eval(
-                    dL
-                )  # the splat below reads it inside a recorded loop, where pending writes are not seen
-            image += p.share * films.develop_samples(
-                job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4
-            )
+                dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
+            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
     return image
 
 
@@ -145,15 +143,12 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue
-            δL = (
-                p.share
-                * p.weight
-                * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
-            )
+            δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
             δL = dr.gather(mi.Spectrum, δL, lane)
             λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job.facts))
             if job.facts.camera_moves:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():
-                    dr.backward_from(dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d))
+                    adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
+                    dr.backward_from(adjoint, flags=dr.ADFlag.ClearVertices)  # other terms need the sensor's edges
             dr.eval()

@@ -87,7 +87,7 @@ def weld_vertices(positions: np.ndarray, tolerance: float | None = None) -> np.n
     a, b = (np.concatenate(side) for side in zip(*links, strict=True))
     if len(a) == 0:
         return rep
-    return distinct[_components(len(distinct), a, b)][np.searchsorted(distinct, rep)]
+    return distinct[connected_components(len(distinct), a, b)][np.searchsorted(distinct, rep)]
 
 
 def build_edge_topology(
@@ -248,7 +248,7 @@ def _links_in_grid(scaled: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, n
     return a[keep], b[keep]
 
 
-def _components(n: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def connected_components(n: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(n,) smallest node in the connected component of each node of the graph with edges a—b."""
     label = np.arange(n)
     while True:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from numbers import Integral
 
 from .errors import OptionError
 
@@ -27,6 +28,8 @@ class Options:
     record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes
 
     def __post_init__(self):
+        for field in fields(self):
+            self._require_type(field.name, getattr(self, field.name), field.default)
         if self.max_depth < 0 and self.max_depth != -1:
             raise OptionError(f"max_depth = {self.max_depth}: use a depth >= 0, or -1 for unlimited")
         if self.rr_depth <= 0:
@@ -41,9 +44,26 @@ class Options:
             raise OptionError(f"record_mib = {self.record_mib}: at least 16 MiB are needed")
 
     @staticmethod
+    def _require_type(name: str, value, default) -> None:
+        """Mitsuba hands over what the scene file says, whatever its type: <string>, <float>, <boolean>."""
+        if isinstance(default, bool):
+            if not isinstance(value, bool):
+                raise OptionError(
+                    f"{name} = {value!r} is of type {type(value).__name__}: use true or false "
+                    f'(<boolean name="{name}" .../> in a scene file)'
+                )
+        elif value is not None or default is not None:
+            require_count(name, value, f' (<integer name="{name}" .../> in a scene file)')
+
+    @staticmethod
     def from_properties(props) -> Options:
         """Read every field from Mitsuba `Properties`; the loader then rejects whatever was not read."""
         return Options(**{f.name: props.get(f.name, f.default) for f in fields(Options)})
+
+    def budget(self, name: str) -> int | None:
+        """Samples per pixel under the property `name`; `sppd` that is not set follows `sppi`."""
+        value = getattr(self, name)
+        return self.sppi if value is None and name == "sppd" else value
 
     @property
     def depth_limit(self) -> int:
@@ -51,8 +71,27 @@ class Options:
         return UNLIMITED if self.max_depth == -1 else self.max_depth
 
 
+def require_count(name: str, value, hint: str = "") -> None:
+    """Raise `OptionError` unless `value` is a whole number that Mitsuba can store."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise OptionError(f"{name} = {value!r} is of type {type(value).__name__}: use a whole number{hint}")
+    if not -(2**31) <= value < 2**31:
+        raise OptionError(f"{name} = {value}: use a number below 2^31")
+
+
+def require_runtime(seed, samples: int) -> None:
+    """Raise `OptionError` unless a render call can use these; `samples` is the largest count of any term."""
+    if samples >= 2**32:
+        raise OptionError(f"{samples} samples are more than 2^32: use fewer per pixel and average several seeds")
+    if isinstance(seed, Integral) and not 0 <= seed < 2**32:
+        raise OptionError(f"seed = {seed}: use a number from 0 to 2^32 - 1")
+
+
 def samples_per_pixel(term_spp: int | None, runtime_spp: int, sampler_spp: int) -> int:
     """Mitsuba's rule for projective integrators: 0 disables, then runtime, then the plugin's, then the sampler's."""
+    require_count("spp", runtime_spp)
+    if runtime_spp < 0:
+        raise OptionError(f"spp = {runtime_spp}: use a count >= 1 (0 leaves it to the integrator and the sampler)")
     if term_spp == 0:
         return 0
     if runtime_spp != 0:

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from psdr_jit.errors import ParameterError
+from psdr_jit.errors import ParameterError, SceneError
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,15 @@ def differentiable_params(scene: Any, params: Any = None) -> list[ParamInfo]:
     The verdict follows from the value's type. Mitsuba's own `NonDifferentiable` flag is not consulted: camera
     and lamp poses carry it although they are ordinary attached transforms.
     """
-    params = mi.traverse(scene) if params is None else params
+    params = _traversed(scene) if params is None else params
     return [_describe(params, name) for name in params.keys()]
 
 
 def find_param(scene: Any, name: str, params: Any = None) -> ParamInfo:
     """The description of parameter `name`; raises `ParameterError` when unknown or not differentiable."""
-    params = mi.traverse(scene) if params is None else params
+    params = _traversed(scene) if params is None else params
+    if not isinstance(name, str):
+        raise ParameterError(f"a parameter is given by its name, such as 'shape.to_world', got {name!r}")
     if name not in params:
         raise ParameterError(f"the scene has no parameter '{name}'{_suggestion(name, list(params.keys()))}")
     info = _describe(params, name)
@@ -44,6 +46,19 @@ def find_param(scene: Any, name: str, params: Any = None) -> ParamInfo:
         raise ParameterError(f"parameter '{name}' cannot be differentiated: {info.reason}. "
                              "'psdr params SCENE.xml' lists those that can")
     return info
+
+
+def _traversed(scene: Any) -> Any:
+    if not isinstance(scene, mi.Object):
+        raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
+                         "load one with mi.load_file")
+    return mi.traverse(scene)
+
+
+def _value(params: Any, name: str) -> Any:
+    """`params[name]`, which fails where a parameter is unset (None), as in the BSDF `hair`."""
+    value, kind, node, _ = params.properties[name]
+    return None if (value if kind is None else params.get_property(value, kind, node)) is None else params[name]
 
 
 def _suggestion(name: str, known: list[str]) -> str:
@@ -56,7 +71,7 @@ def _suggestion(name: str, known: list[str]) -> str:
 
 
 def _describe(params: Any, name: str) -> ParamInfo:
-    value = params[name]
+    value = _value(params, name)
     reason = _obstacle(name, value)
     differentiable = not reason
     if differentiable and name.endswith("vertex_normals"):
@@ -73,7 +88,7 @@ def _shape(value: Any) -> tuple[int, ...]:
     if is_transform(value):
         n = int(type(value).__name__[-2])
         return (n, n)
-    if not dr.is_array_v(value):
+    if value is None or not dr.is_array_v(value):
         return ()
     shape = tuple(dr.shape(value))
     # a JIT vector has a trailing lane dimension, which is 1 for a uniform parameter
@@ -83,6 +98,8 @@ def _shape(value: Any) -> tuple[int, ...]:
 def _obstacle(name: str, value: Any) -> str:
     """Why a value of this type carries no derivative; empty when it does."""
     kind = type(value).__name__
+    if value is None:
+        return "it is not set: this object works without it"
     if isinstance(value, (bool, int, float)):
         return f"Mitsuba stores it as a plain Python {kind}, which Dr.Jit does not track"
     if ".film." in f".{name}":
@@ -108,6 +125,7 @@ def _kind(params: Any, name: str, value: Any) -> str:
     while node is not None:
         for cls, kind in owners:
             if isinstance(node, cls):
-                return "texture" if kind == "material" and dr.is_tensor_v(value) else kind
+                textured = kind == "material" and value is not None and dr.is_tensor_v(value)
+                return "texture" if textured else kind
         node = params.hierarchy[node][0]
     return "other"

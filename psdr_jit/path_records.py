@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .path_steps import shadow_hit
+from .path_steps import NoSink, shadow_hit
 from .records import Arrival, EmitterSample, Hit, Vertex
 
 
@@ -52,6 +52,9 @@ class PathRecords:
             inv_pdf=dr.empty(mi.Float, size),
         )
 
+    def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
+        """Not needed: the sweeps add up radiance themselves."""
+
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex `k` of the active lanes (the sink interface of `path_steps.walk`)."""
         dr.scatter(self.vertices, vertex, k * self.lanes + self.lane, active, mode=dr.ReduceMode.Permute)
@@ -69,3 +72,24 @@ class PathRecords:
             β=dr.gather(mi.Spectrum, v.β, index, active),
             weight_emission=dr.gather(mi.Float, v.weight_emission, index, active),
         )
+
+
+class RadianceByDepth(NoSink):
+    """Keeps the radiance of every path length, so that a subpath in front of it can use what its depth leaves."""
+
+    def __init__(self, lanes: int, depth: int):
+        self.lanes, self.depth = lanes, depth
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.values = dr.zeros(mi.Spectrum, lanes * depth)
+        self.reached = dr.zeros(mi.UInt32, lanes)  # entries written, per lane
+        dr.make_opaque(self.values, self.reached)
+
+    def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
+        dr.scatter(self.values, L, k * self.lanes + self.lane, active)
+        dr.scatter(self.reached, k + 1, self.lane, active)
+
+    def up_to(self, k: mi.UInt32, lane: mi.UInt32, final: mi.Spectrum) -> mi.Spectrum:
+        """Radiance of `lane` with at most `k` segments beyond the first vertex; `final`: of the whole path."""
+        stored = k < dr.gather(mi.UInt32, self.reached, lane)
+        value = dr.gather(mi.Spectrum, self.values, k * self.lanes + lane, stored)
+        return dr.select(stored, value, final)

@@ -24,6 +24,7 @@ class PathLimits:
 
     max_depth: int
     rr_depth: int
+    end_black: bool = True  # a throughput of 0 ends the path; not if its derivative is wanted
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
@@ -57,15 +58,20 @@ class NoSink:
 
     connect = staticmethod(shadow_test)
 
+    def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
+        """Radiance so far: everything of at most `k` segments beyond the first vertex."""
+
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex number `k` (0: the first) of every active lane."""
 
 
-def continue_path(sampler, β: mi.Spectrum, η: mi.Float, k: mi.UInt32, rr_depth: int):
+def continue_path(sampler, β: mi.Spectrum, η: mi.Float, k: mi.UInt32, rr_depth: int, end_black: bool = True):
     """Russian roulette after vertex `k`: `(β / survival, η, survives, 1 / survival)`. Mitsuba's criterion."""
     β_max = dr.max(β)
     survival = dr.select(k + 1 >= rr_depth, dr.minimum(β_max * dr.square(η), 0.95), 1)
-    survives = (β_max != 0) & (sampler.next_1d() < survival)
+    survives = sampler.next_1d() < survival
+    if end_black:
+        survives &= β_max != 0
     inv_survival = dr.select(survives, dr.rcp(survival), 0)
     return β * inv_survival, η, survives, inv_survival
 
@@ -78,7 +84,9 @@ def skip_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection
     active = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array comparison)
     while dr.hint(active, label="psdr.skip_emitters"):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        rest = ray.maxt - pi.t
         ray = si.spawn_ray(ray.d)
+        ray.maxt = rest
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     return ray, pi
@@ -110,7 +118,8 @@ def walk(
     radiance estimate, the number of vertices visited, and whether the first vertex was a surface (for alpha).
     Detached throughout; estimator: Kajiya's path tracing with MIS [Veach 1997, §10.3].
     """
-    max_depth, rr_depth = limits.max_depth, limits.rr_depth  # a frozen dataclass cannot be loop state
+    # a frozen dataclass cannot be loop state
+    max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
     ctx = mi.BSDFContext()
 
     ray = mi.Ray3f(ray)
@@ -134,6 +143,8 @@ def walk(
         weight_emission = dr.select(emission, mis_weight(prev_pdf, pdf_em), 0)
         L += β * weight_emission * ds.emitter.eval(si, emission)
 
+        sink.radiance(k, L, active)
+
         alive = si.is_valid() & (k + 1 < max_depth)
         bsdf = si.bsdf()
         active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -146,8 +157,8 @@ def walk(
         L[active_em] += β * mis_em * f_em * value_em
 
         is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        β_next, η, survives, inv_survival = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
-        alive &= survives
+        β_next, η, survives, inv_survival = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        alive &= survives & (bs.pdf > 0)
 
         sink.write(
             k,

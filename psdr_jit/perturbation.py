@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.errors import ParameterError
+from psdr_jit.errors import ParameterError, SceneError
 from psdr_jit.params import ParamInfo, find_param, is_transform
 
 
@@ -86,8 +87,14 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     - `index=i`: one scalar of the parameter in flat order;
     - otherwise `direction` is one number, or as many as the parameter has scalars; default: all ones.
     """
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
+                         "load one with mi.load_file")
     params = mi.traverse(scene)
     info = find_param(scene, name, params)
+    _require_faces(params.properties[name][2])
+    if index is not None and (isinstance(index, bool) or not isinstance(index, Integral)):
+        raise ParameterError(f"index must be a whole number, got {index!r}")
     if sum(x is not None for x in (direction, rotate, index)) > 1:
         raise ParameterError("give one of direction, rotate and index, not several")
     base = dr.detach(params[name])
@@ -109,6 +116,12 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     return _addition(common, base, direction, index)
 
 
+def _require_faces(node: Any) -> None:
+    """Mitsuba fails to update a mesh without faces."""
+    if isinstance(node, mi.Mesh) and node.face_count() == 0:
+        raise SceneError(f"mesh '{node.id()}' has no faces; remove it or fix its file")
+
+
 def _is_full_direction(direction: Any, base: Any) -> bool:
     """True when the direction has one number for each scalar of the parameter (and there are more than 3)."""
     if direction is None or is_transform(base):
@@ -117,7 +130,10 @@ def _is_full_direction(direction: Any, base: Any) -> bool:
 
 
 def _numbers(values: Any, what: str) -> np.ndarray:
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f"{what} must be made of numbers, got {values!r}") from error
     if not np.all(np.isfinite(array)) or not np.any(array):
         raise ParameterError(f"{what} must be finite and not all zero, got {values}")
     return array

@@ -6,6 +6,7 @@ prints the table of what is supported.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -15,12 +16,14 @@ from .compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
 from .errors import UnsupportedError
 from .scene_probes import (
     SceneGraph,
+    blends_delta,
     delta_lobes,
     is_hard_edged,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
     plugin_name,
+    weights_of_delta_lobes,
 )
 from .support import ANALYTIC_SHAPES, POSE_PARAMETERS, UNSUPPORTED_SHAPES, support_table
 
@@ -44,6 +47,9 @@ class ShapeFacts:
     bsdf: str  # plugin, as written in XML
     bsdf_flags: int  # mi.BSDFFlags
     delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
+    delta_weights: tuple[str, ...]  # enabled parameters that scale or steer a delta lobe, full names
+    delta_varies: bool  # such a parameter, enabled or not, varies over the surface
+    blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
     jumps: tuple[str, ...]  # what is discontinuous inside the surface, "checkerboard 'floor'", ...
     geometry: tuple[str, ...]  # parameters that move the surface
     shading: tuple[str, ...]  # vertex normals, texture coordinates and attributes
@@ -90,6 +96,7 @@ class SceneFacts:
     emitters: tuple[EmitterFacts, ...]
     sensor: SensorFacts
     enabled: tuple[str, ...]  # all parameters with gradients enabled, as `mi.traverse(scene)` names them
+    extent: float  # diagonal of the scene's bounding box [scene units], 0 without shapes
 
     @property
     def anything_enabled(self) -> bool:
@@ -170,7 +177,13 @@ def analyse(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> SceneFacts:
             ),
             sensor=_sensor_facts(graph, sensor),
             enabled=graph.enabled_names(),
+            extent=_extent(scene),
         )
+
+
+def _extent(scene: mi.Scene) -> float:
+    box = scene.bbox()
+    return math.dist(box.max, box.min) if box.valid() else 0.0
 
 
 def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: int) -> ShapeFacts:
@@ -178,6 +191,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
     shading = tuple(name for name in enabled if _only_shades(name))
+    delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
     if plugin in UNSUPPORTED_SHAPES:
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
@@ -200,6 +214,9 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         bsdf=plugin_name(bsdf) if bsdf is not None else "none",
         bsdf_flags=bsdf.flags() if bsdf is not None else 0,
         delta_lobes=delta_lobes(graph, bsdf),
+        delta_weights=delta_weights,
+        delta_varies=delta_varies,
+        blends_delta=blends_delta(graph, bsdf),
         jumps=jumping_textures(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),

@@ -8,14 +8,23 @@ radiance gradients of the same scene go through.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from .compat import VERTEX_TEXCOORDS
+from .compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
 from .errors import ParameterError, PsdrError, SceneError, UnsupportedError, UnsupportedWarning
 from .mesh_edges import EdgeTopology
 from .scene_analysis import SceneFacts, ShapeFacts
-from .support import SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+from .support import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+
+SMALL_SCENE = 0.1
+"""Diagonal [scene units] below which the primary term loses more than 0.2 % (measured on a lit box)."""
+
+BOUNDARY_TERMS = {
+    "direct": (2, "moving shadows of the light sources"),
+    "indirect": (3, "moving occlusion of reflected light"),
+}
+"""Terms that the theory has besides interior and primary: from which max_depth on, and what they stand for."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +117,14 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
     surfaces, is seen past moving edges, and its outline moves over the film with the camera. Only when
     nothing moves do its silhouettes stand still in every view.
     """
+    if not facts.shapes:
+        yield Finding(UnsupportedError, "", "the scene has no shapes: there is nothing to scatter light; add one")
     for shape in facts.shapes:
         label = f"shape '{shape.name}' ({shape.plugin})"
+        if shape.plugin in INSTANCING:
+            text = f"{label}: no term knows on which instance a path was; {UNSUPPORTED_SHAPES[shape.plugin]}"
+            yield Finding(UnsupportedError, shape.name, text)
+            continue
         if shape.bad_vertices:
             yield Finding(
                 SceneError, shape.name,
@@ -148,6 +163,36 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
                 "missing; use a rough BSDF (such as roughconductor, roughdielectric or roughplastic), or "
                 "differentiate materials and radiance only",
             )  # fmt: skip
+
+
+def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
+    """The sweeps take the weight and the direction of a delta lobe for constants (see `interior.vertex_terms`)."""
+    for shape in facts.shapes:
+        # moving geometry, which attaches the normals as well, is refused by `check_specular`
+        watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
+        steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]
+        enabled = list(shape.delta_weights) + [f"{shape.name}.{name}" for name in steering]
+        if enabled:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"{', '.join(enabled)}: the derivative through a perfectly specular or pass-through lobe "
+                f"({', '.join(shape.delta_lobes)} of shape '{shape.name}') is not modelled and would be 0; use a rough "
+                "BSDF (such as roughconductor, roughdielectric or roughplastic), or do not enable this parameter",
+            )  # fmt: skip
+        if shape.blends_delta:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"shape '{shape.name}' has a blendbsdf of a smooth and a perfectly specular BSDF, whose sampling "
+                "density Mitsuba does not report; use a rough BSDF in place of the specular one",
+            )  # fmt: skip
+
+
+def check_extent(facts: SceneFacts) -> Iterator[Finding]:
+    """Mitsuba keeps rays off surfaces by absolute distances, and edges of that size blur."""
+    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE:
+        text = (f"the scene is only {facts.extent:.2g} units across, where Mitsuba's ray offsets (absolute lengths) "
+                "swallow a part of the derivative (1 % at 0.03, 9 % at 0.003); scale the scene up")  # fmt: skip
+        yield Finding(UnsupportedWarning, "", text)
 
 
 def check_surface_steps(facts: SceneFacts) -> Iterator[Finding]:
@@ -204,13 +249,44 @@ CHECKS = (
     check_sensor,
     check_shapes,
     check_specular,
+    check_delta_weights,
+    check_extent,
     check_surface_steps,
     check_emitter_steps,
 )
 
 
+def warn_about_missing_terms(facts: SceneFacts, terms: Iterable[str], depth_limit: int, said: dict) -> None:
+    """Warn once if shadows or indirect visibility move and no term is there for them.
+
+    `terms` are the names in `terms.TERMS`; `said` remembers what has been warned about, per caller.
+    """
+    if not (facts.geometry_moves and facts.emitters):
+        return
+    missing = [f"'{name}' ({what})" for name, (depth, what) in BOUNDARY_TERMS.items()
+               if name not in terms and depth_limit >= depth]  # fmt: skip
+    if not missing:
+        return
+    moving = [f"shape '{s.name}'" for s in facts.shapes if s.moves]
+    moving += [f"emitter '{e.name}'" for e in facts.emitters if e.pose]
+    moving += [f"sensor '{facts.sensor.name}'"] if facts.camera_moves else []
+    message = (
+        f"{' and '.join(missing)} not in the derivative with respect to the motion of {', '.join(moving)}: these "
+        "boundary terms do not exist yet. psdr_jit.check_gradient (psdr gradient --check) tells how much that is; "
+        "with max_depth=1 it is nothing"
+    )
+    if message not in said.setdefault("missing terms", set()):
+        said["missing terms"].add(message)
+        warnings.warn(message, UnsupportedWarning, stacklevel=2)
+
+
 def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
-    """Warn about the faces and edges of shape `name` that have no place in a surface, with their number."""
+    """Warn about the faces and edges of shape `name` that have no place in a surface, with their number.
+
+    A mesh without any edge is refused: nothing of it can be seen, and there is nothing to sample.
+    """
+    if len(topology) == 0:
+        raise SceneError(f"mesh '{name}' has no face with an area; remove it or fix its file")
     remarks = (
         (topology.degenerate_faces, "faces without area, which are left out"),
         (topology.duplicate_faces, "faces that repeat another one, which are left out"),

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib import resources
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from psdr_jit.errors import OptionError, SceneError, SetupError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
+
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+PLY_INDEX_NAMES = ("vertex_index", "vertex_indices")
 
 
 def use_variant(name: str) -> None:
@@ -37,12 +48,13 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
         raise SceneError(f"scene file '{path}' does not exist: check the path")
     if not os.access(path, os.R_OK):
         raise SceneError(f"scene file '{path}' cannot be read: check its permissions")
+    meshes = _check_mesh_files(path, defaults)
     try:
         scene = mi.load_file(os.fspath(path), optimize=False, **{k: str(v) for k, v in defaults.items()})
     except (RuntimeError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
-        meshes = _mesh_files(path, defaults) if "shape plugin" in text else []
-        if meshes and not any(mesh in text for mesh in meshes):
+        text = _cause(error)
+        by_mesh = "shape plugin" in text or isinstance(error, UnicodeDecodeError)
+        if by_mesh and meshes and not any(mesh in text for mesh in meshes):
             text += f" Is one of its mesh files empty or corrupt: {', '.join(meshes)}?"
         raise SceneError(f"scene file '{path}' cannot be loaded: {text}") from error
     if not isinstance(scene, mi.Scene):
@@ -51,6 +63,15 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
     if not scene.sensors():
         raise SceneError(f"scene file '{path}' has no <sensor>: there is no image to render")
     return scene
+
+
+def _cause(error: Exception) -> str:
+    """What Mitsuba says, without its source lines; what one of our plugins says, without Python's traceback."""
+    own = re.findall(r"\b(?:Parameter|Option|Scene|Unsupported)Error: (.*)", str(error))
+    text = own[-1] if own else " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
+    if 'Plugin "psdr_' in text and "_ad_" not in mi.variant():
+        return f"its integrator needs derivatives, which {mi.variant()} does not track; use {DEFAULT_VARIANT}"
+    return text
 
 
 def integrator_properties(path: str | os.PathLike, **defaults: Any) -> dict[str, Any]:
@@ -73,9 +94,23 @@ def shipped_scene(name: str) -> Path:
 
 def check_sensor(scene: Any, index: int) -> None:
     """Raise `OptionError` unless the scene has a sensor with this index."""
+    find_sensor(scene, index)
+
+
+def find_sensor(scene: Any, sensor: Any) -> Any:
+    """The sensor itself, or the one with this index; a typed error if there is none."""
+    if not isinstance(scene, mi.Scene):
+        raise SceneError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    if isinstance(sensor, mi.Sensor):
+        return sensor
     count = len(scene.sensors())
-    if not 0 <= index < count:
-        raise OptionError(f"there is no sensor {index}: the scene has {count} (0 to {count - 1})")
+    if count == 0:
+        raise SceneError("the scene has no sensor: there is no image to differentiate; add a <sensor>")
+    if isinstance(sensor, bool) or not isinstance(sensor, Integral):
+        raise OptionError(f"sensor = {sensor!r}: expected an index from 0 to {count - 1}, or a Mitsuba sensor")
+    if not 0 <= sensor < count:
+        raise OptionError(f"there is no sensor {sensor}: the scene has {count} (0 to {count - 1})")
+    return scene.sensors()[int(sensor)]
 
 
 def _nodes(path: str | os.PathLike, defaults: dict[str, Any]) -> Any:
@@ -88,3 +123,78 @@ def _mesh_files(path: Path, defaults: dict[str, Any]) -> list[str]:
     """Names of the files that the scene's shapes are read from."""
     shapes = [n.props for n in _nodes(path, defaults) if n.type == mi.ObjectType.Shape]
     return [str(props["filename"]) for props in shapes if "filename" in props.keys()]
+
+
+def _check_mesh_files(path: Path, defaults: dict[str, Any]) -> list[str]:
+    """Names of the scene's mesh files, empty if the scene file itself is corrupt.
+
+    Refuses PLY files whose faces refer to vertices that are not there: reading them ends Mitsuba's process.
+    """
+    try:
+        names = _mesh_files(path, defaults)
+    except (RuntimeError, UnicodeDecodeError):
+        return []       # Mitsuba says so when it loads the scene
+    for file in [path.parent / name for name in names if name.lower().endswith(".ply")]:
+        found = _largest_index(file) if file.is_file() else None
+        if found is not None and found[0] >= found[1]:
+            raise SceneError(f"scene file '{path}' cannot be loaded: mesh file '{file}' is corrupt: a face refers to "
+                             f"vertex {found[0]}, but there are {found[1]}")
+    return names
+
+
+def _largest_index(path: Path) -> tuple[int, int] | None:
+    """`(largest vertex index, number of vertices)` of a PLY file; None if it is none of triangles, or not understood.
+
+    A negative index counts as unsigned, as in Mitsuba.
+    """
+    try:
+        data = path.read_bytes()
+        header, _, body = data.partition(b"end_header")
+        encoding, elements = _ply_header(header.decode("ascii"))
+        body = body[body.index(b"\n") + 1 :]
+        index = _ascii_indices(body, elements) if encoding == "ascii" else _binary_indices(body, encoding, elements)
+    except (OSError, ValueError, KeyError, IndexError):
+        return None     # Mitsuba's reader knows better what is wrong
+    return (int(index.astype(np.uint32).max()) if index.size else -1), elements["vertex"][0]
+
+
+def _ply_header(header: str) -> tuple[str, dict[str, tuple[int, list[list[str]]]]]:
+    """Encoding, and of each element its count and the words of its property lines."""
+    encoding, elements, properties = "", {}, []
+    for words in (line.split() for line in header.splitlines()):
+        if words[:1] == ["format"]:
+            encoding = words[1]
+        elif words[:1] == ["element"]:
+            properties = []
+            elements[words[1]] = (int(words[2]), properties)
+        elif words[:1] == ["property"]:
+            properties.append(words[1:])
+    if list(elements)[:2] != ["vertex", "face"]:
+        raise ValueError("another order of elements")
+    return encoding, elements
+
+
+def _ascii_indices(body: bytes, elements: dict[str, Any]) -> np.ndarray:
+    skip, count = elements["vertex"][0], elements["face"][0]
+    if elements["face"][1][0][-1] not in PLY_INDEX_NAMES:
+        raise ValueError("faces start with something else")
+    rows = [line.split()[1:4] for line in body.decode("ascii").splitlines()[skip : skip + count]]
+    return np.array(rows, dtype=np.int64)
+
+
+def _binary_indices(body: bytes, encoding: str, elements: dict[str, Any]) -> np.ndarray:
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    (vertices, vertex), (faces, face) = elements["vertex"], elements["face"]
+    start = vertices * sum(np.dtype(PLY_TYPES[kind]).itemsize for kind, _ in vertex)
+    fields = []
+    for words in face:
+        if words[0] != "list":
+            fields.append((words[1], order + PLY_TYPES[words[0]]))
+        elif words[3] in PLY_INDEX_NAMES:
+            fields += [("corners", order + PLY_TYPES[words[1]]), ("index", order + PLY_TYPES[words[2]], 3)]
+        else:
+            raise ValueError("lists of other things")
+    table = np.frombuffer(body, np.dtype(fields), faces, start)
+    if np.any(table["corners"] != 3):
+        raise ValueError("not all faces are triangles")
+    return table["index"].astype(np.int64)

@@ -13,13 +13,17 @@ import mitsuba as mi
 import numpy as np
 
 from .compat import mesh_positions
-from .support import JUMPING_PLUGINS, PLUGIN_NAMES
+from .support import JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
 
 HARD_EDGE = 1e-3
 """A spot whose rim is thinner than this fraction of its cone counts as a step: no sampling resolves it."""
 
 UNEVEN_SCALE = 1e-4
 """Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
+
+
+DELTA_KINDS = ("Null", "DeltaReflection", "DeltaTransmission", "Delta1D")
+"""The lobes (names in `mi.BSDFFlags`) that have no value to evaluate, only samples."""
 
 
 class SceneGraph:
@@ -42,7 +46,7 @@ class SceneGraph:
 
     def _collect(self, params, prefix: str) -> None:
         for name, (_, _, node, _) in params.properties.items():
-            value = params[name]
+            value = parameter_value(params, name)
             self._values.setdefault(id(node), {})[_last(name)] = value
             if _grad_enabled(value):
                 self._enabled[prefix + name] = id(node)
@@ -57,6 +61,10 @@ class SceneGraph:
     def enabled_of(self, node: mi.Object) -> tuple[str, ...]:
         """The node's own enabled parameters, by their last name."""
         return tuple(_last(name) for name, owner in self._enabled.items() if owner == id(node))
+
+    def enabled_full(self, node: mi.Object) -> tuple[str, ...]:
+        """The node's own enabled parameters, by their full names."""
+        return self._enabled_in([node])
 
     def enabled_below(self, node: mi.Object | None, skip: tuple[type, ...] = ()) -> tuple[str, ...]:
         """Enabled parameters of everything that `node` refers to, by their full names."""
@@ -95,8 +103,19 @@ class SceneGraph:
         return known if known and not known.startswith("_unnamed_") else f"{plugin_name(node)} #{index}"
 
 
+def parameter_value(params, name: str):
+    """`params[name]`, which fails where a parameter of an object is unset (None), as in `hair`."""
+    value, kind, node, _ = params.properties[name]
+    unset = (value if kind is None else params.get_property(value, kind, node)) is None
+    return None if unset else params[name]
+
+
 def _child_objects(node: mi.Object) -> list[mi.Object]:
     """The objects that `node` refers to directly."""
+    return [child for _, child in _named_children(node)]
+
+
+def _named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
     callback = _children_callback()()
     node.traverse(callback)
     return callback.found
@@ -113,7 +132,7 @@ def _children_callback() -> type:
 
         def put(self, name, value, flags, cpptype=None):
             if isinstance(value, mi.Object):
-                self.found.append(value)
+                self.found.append((name, value))
 
     return Children
 
@@ -123,7 +142,7 @@ def _last(name: str) -> str:
 
 
 def _grad_enabled(value) -> bool:
-    return not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
+    return value is not None and not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
 
 
 def plugin_name(node: mi.Object) -> str:
@@ -134,18 +153,50 @@ def plugin_name(node: mi.Object) -> str:
 
 def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
     """The perfectly specular and pass-through lobes of a BSDF, each with the nested plugin it comes from."""
-    kinds = ("Null", "DeltaReflection", "DeltaTransmission", "Delta1D")
     lobes = {}
     for node in graph.walk(bsdf):
         if not isinstance(node, mi.BSDF):
             continue
         nested = [child for child in graph.walk(node)[1:] if isinstance(child, mi.BSDF)]
-        for kind in kinds:
+        for kind in DELTA_KINDS:
             bit = int(getattr(mi.BSDFFlags, kind))
             # an adapter such as "twosided" repeats the flags of what it wraps: blame the innermost plugin
             if node.flags() & bit and not any(child.flags() & bit for child in nested):
                 lobes[f"{plugin_name(node)}: {kind}"] = None
     return tuple(lobes)
+
+
+def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
+    """Enabled parameters that scale or steer a delta lobe (full names), and whether one varies over the surface.
+
+    A BSDF that only wraps others (`mask`, `blendbsdf`, `normalmap`) counts when one of those has a delta lobe.
+    """
+    enabled, varies = {}, False
+    for node in graph.walk(bsdf):
+        if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
+            continue
+        own = [
+            child
+            for name, child in _named_children(node)
+            if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
+        ]
+        for child in own:
+            enabled |= dict.fromkeys(graph.enabled_from(child))
+            varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
+        enabled |= dict.fromkeys(graph.enabled_full(node))
+    return tuple(enabled), varies
+
+
+def blends_delta(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a `blendbsdf` mixes a delta lobe with a smooth one."""
+    blends = [node for node in graph.walk(bsdf) if plugin_name(node) == "blendbsdf"]
+    return any(_has_delta_lobe(node) and node.flags() & int(mi.BSDFFlags.Smooth) for node in blends)
+
+
+def _has_delta_lobe(bsdf: mi.BSDF) -> bool:
+    if plugin_name(bsdf) == "hair":  # says that it has a null lobe, and never samples it
+        return False
+    return any(bsdf.flags() & int(getattr(mi.BSDFFlags, kind)) for kind in DELTA_KINDS)
 
 
 def jumping_textures(graph: SceneGraph, owner: mi.Object | None) -> tuple[str, ...]:

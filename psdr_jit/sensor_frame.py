@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import UnsupportedError
+from .film import sampled_window
 
 KINDS = {
     "PerspectiveCamera": "perspective",
@@ -36,6 +37,8 @@ class SensorFrame:
     aperture: float  # lens radius, 0 for a pinhole
     crop_offset: tuple[int, int]
     crop_size: tuple[int, int]
+    stretch: tuple[float, float]  # of the pose, across and along the view (a perspective pose has none)
+    window: tuple[tuple[float, float], tuple[float, float]]  # film region with camera samples [px]
 
     @property
     def px_area(self) -> float:
@@ -97,7 +100,16 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         aperture=aperture,
         crop_offset=tuple(film.crop_offset()),
         crop_size=tuple(film.crop_size()),
+        stretch=_stretch(to_world),
+        window=tuple(tuple(map(float, corner)) for corner in sampled_window(film)),
     )
+
+
+def _stretch(to_world: mi.Transform4f) -> tuple[float, float]:
+    """Area factor across and length factor along the view: an orthographic pose carries the sensor's width."""
+    x, y, z = (to_world @ axis for axis in (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)))
+    length = float(dr.norm(z)[0])
+    return float(dr.abs(dr.dot(dr.cross(x, y), z))[0]) / length, length
 
 
 def lens_point(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Point3f:
@@ -133,9 +145,9 @@ def look_at(frame: SensorFrame, x: mi.Point3f, aperture_sample: mi.Point2f) -> V
     valid = (q.z > frame.near) & (q.z < frame.far)
     if frame.kind == "orthographic":
         plane = mi.Point2f(q.x, q.y)
-        origin, direction = mi.Point3f(q.x, q.y, frame.near), mi.Vector3f(0, 0, 1)
-        J_px = mi.Float(frame.px_area)
-        r = q.z - frame.near
+        origin, direction = mi.Point3f(q.x, q.y, frame.near), mi.Vector3f(0, 0, 1 / frame.stretch[1])
+        J_px = mi.Float(frame.px_area * frame.stretch[0])
+        r = (q.z - frame.near) * frame.stretch[1]
     else:
         a = lens_point(frame, aperture_sample)
         slope = (q - a) / q.z

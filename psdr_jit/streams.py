@@ -16,6 +16,11 @@ class Stream(IntEnum):
     INTERIOR = 3  # not the camera's: Mitsuba's samplers hash (seed, lane) as `lane_sampler` does
     PRIMARY_EDGE = 1
     PRIMARY_RADIANCE = 2
+    DIRECT_EDGE = 4
+    DIRECT_SUBPATH = 5
+    INDIRECT_EDGE = 6
+    INDIRECT_SUBPATH = 7
+    INDIRECT_RADIANCE = 8
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -46,11 +46,17 @@ UNSUPPORTED_SHAPES = {
 }
 """Shapes without an edge set: plugin -> the way out."""
 
+INSTANCING = frozenset({"instance", "shapegroup"})
+"""Refused even if nothing moves: a recorded path vertex does not know which instance it is on."""
+
 SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 """Sensors whose film position of a scene point is known, so that edges can be projected."""
 
 JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
 """Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
+
+SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance")})
+"""(plugin, parameter) of materials with a delta lobe: those that only shape the smooth lobe beside it."""
 
 POSE_PARAMETERS = frozenset({
     "to_world", "position", "direction", "sun_direction",
@@ -70,7 +76,8 @@ _MOVING = "while geometry, a light's pose or the camera is differentiated; "
 SUPPORT = (
     Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
     Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
-    Row("instances, SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("instances", "error", "materials as well: load the mesh once per copy"),
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
     Row("perspective, thin lens, orthographic sensor", "yes", ""),
@@ -82,12 +89,18 @@ SUPPORT = (
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask, hair", "error",
         _MOVING + "motion transport through specular vertices is missing"),
+    Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
+        "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
+    Row("blendbsdf of a smooth and a perfectly specular material", "error",
+        "Mitsuba does not report its sampling density"),
     Row("checkerboard, nearest-neighbour bitmap, bump map, face attributes", "warning",
         _MOVING + "steps inside a surface may slide and are not sampled"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
-    Row("NaN vertices, empty meshes", "error", ""),
+    Row("films that convert samples themselves (specfilm)", "error", ""),
+    Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
+    Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
 )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from . import interior_term
-from .boundary import primary
+from .boundary import direct, indirect, primary
 from .job import Job
 
 
@@ -28,4 +28,6 @@ class Term:
 TERMS = (
     Term("interior", "sppc", interior_term.forward, interior_term.backward),
     Term("primary", "sppp", primary.forward, primary.backward),
+    Term("direct", "sppd", direct.forward, direct.backward),
+    Term("indirect", "sppi", indirect.forward, indirect.backward),
 )

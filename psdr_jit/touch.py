@@ -19,7 +19,8 @@ def touches(
 
     The last vertex only emits, and emitters are not in question here, so its ray is never traced.
     """
-    max_depth, rr_depth = limits.max_depth, limits.rr_depth  # a frozen dataclass cannot be loop state
+    # a frozen dataclass cannot be loop state
+    max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
     ray, pi, _emission = first_hit(scene, ray, hide_emitters)
     found = mi.Bool(False)
     β = mi.Spectrum(1)
@@ -31,7 +32,8 @@ def touches(
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         sampler.next_2d()  # spent on emitter sampling in `walk`
         bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-        β, η, alive, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
+        β, η, alive, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        alive &= bs.pdf > 0
         k += 1
         active = alive & ~found & (k + 1 < max_depth)
         ray = si.spawn_ray(si.to_world(bs.wo))
@@ -43,7 +45,7 @@ def touches(
 @dr.syntax
 def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool) -> int:
     """Largest number of vertices among the paths that `walk` would trace (evaluates; unlimited depth only)."""
-    rr_depth = limits.rr_depth
+    rr_depth, end_black = limits.rr_depth, limits.end_black
     ray, pi, _emission = first_hit(scene, ray, hide_emitters)
     β = mi.Spectrum(1)
     η = mi.Float(1)
@@ -53,7 +55,8 @@ def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, 
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         sampler.next_2d()
         bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-        β, η, active, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth)
+        β, η, active, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        active &= bs.pdf > 0
         k += 1
         ray = si.spawn_ray(si.to_world(bs.wo))
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)

@@ -31,6 +31,10 @@ LEAD = 100.0
 #: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
 CURVE_LEAD = 0.02
 
+#: Share of the way from the edge to its face's centroid at which the face's own radiance is taken. On the edge itself
+#: rounding may put the point inside a surface on which the edge rests, and everything it sees would be occluded.
+INSET = 3e-4
+
 #: Share of the distance to the edge that the visibility ray leaves out.
 VISIBILITY_EPSILON = 1e-4
 
@@ -75,9 +79,7 @@ def segment_motion(edges: EdgeSet, row, t, active) -> mi.Point3f:
     """The same point attached to the vertices of its mesh."""
     positions = attached_positions(edges.meshes)
     v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (edges.rows.v0, edges.rows.v1))
-    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(
-        mi.Point3f, positions, v1, active
-    )
+    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(mi.Point3f, positions, v1, active)
 
 
 def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, active) -> tuple[Side, mi.Bool]:
@@ -98,28 +100,26 @@ def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, ac
     towards = dr.select(which == 0, -1.0, 1.0)
     on0, on1 = a0 * towards > 0, ~rows.border & (a1 * towards > 0)
     use1 = on1 & (~on0 | nearer1)
-    own = on0 | on1
+    own = (on0 | on1) & ~rows.traced
     uv = dr.select(use1, face_uv(rows.corner1, t), face_uv(rows.corner0, t))
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.valid = own & active
     pi.t = dr.select(pi.valid, point.view.r, dr.inf)
     pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
-    pi.prim_uv = uv
+    pi.prim_uv = uv + INSET * (1 / 3 - uv)
     pi.shape = dr.gather(mi.ShapePtr, edges.shapes, dr.select(use1, rows.shape1, rows.shape0), active & own)
 
     offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + dr.norm(rows.p1 - rows.p0))
     beside = point.x + towards * offset * point.side - LEAD * offset * ω
     ray = mi.Ray3f(dr.select(own, point.view.o, beside), ω)
-    return Side(ray, pi, ~own), rows.border | silhouette | rows.seam
+    return Side(ray, pi, ~own), rows.border | silhouette | rows.seam | rows.traced
 
 
 def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active):
     """Point at parameter `t` of a piece of an analytic curve: `(EdgePoint, local point, outward, scale)`."""
     rows = dr.gather(type(curves.rows), curves.rows, row, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, rows.shape))
-    local = curve_point(
-        rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture))
-    )
+    local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture)))
     x = transform_point(columns, local.x)
     view = look_at(frame, x, aperture)
     side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, view.ω)

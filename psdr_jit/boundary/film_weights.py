@@ -36,9 +36,7 @@ def _overlaps(frame: SensorFrame, a: mi.Point2f, b: mi.Point2f, margin: mi.Float
     for axis in range(2):
         lower = frame.crop_offset[axis] - border
         upper = frame.crop_offset[axis] + frame.crop_size[axis] + border
-        inside &= (dr.maximum(a[axis], b[axis]) >= lower - margin) & (
-            dr.minimum(a[axis], b[axis]) <= upper + margin
-        )
+        inside &= (dr.maximum(a[axis], b[axis]) >= lower - margin) & (dr.minimum(a[axis], b[axis]) <= upper + margin)
     return inside
 
 
@@ -51,10 +49,8 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     z0, z1 = (frame.to_local @ rows.p0).z, (frame.to_local @ rows.p1).z
 
     s0, s1 = facing(rows.n0, rows.p0, view), facing(rows.n1, rows.p0, view)
-    slack = (
-        frame.aperture if frame.kind == "thinlens" else 0.0
-    )  # how far the viewpoint may be from the centre
-    may_be_silhouette = rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
+    slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
+    may_be_silhouette = rows.traced | rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
     crease = dr.select(rows.seam, dr.clip(rows.angle / FULL_CREASE, 0, 1), 0)
     # Seams of smooth or coplanar faces (textures, split normals) have no angle to go by.
     crease = dr.select(rows.seam & (rows.angle < 1e-2), dr.maximum(crease, 0.25), crease)

@@ -22,9 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import film as films
-from ..analytic_edges import CurveSet, curve_set
-from ..edge_distribution import EdgeDistribution, edge_distribution, pmf, sample_edge, stratified
-from ..edge_set import EdgeSet, edge_set
+from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
 from ..path_steps import NoSink, skip_emitters, walk
 from ..sensor_frame import SensorFrame, sensor_frame
@@ -33,23 +31,20 @@ from . import film_weights
 from .edge_points import (
     VISIBILITY_EPSILON,
     EdgePoint,
-    curve_motion,
     curve_row_point,
     curve_sides,
-    segment_motion,
     segment_point,
     segment_sides,
 )
+from .edges import EdgeTable, distribution_of, edge_motion, edge_table
 
 
 @dataclass(frozen=True)
 class PrimaryEdges:
-    """What can be seen to move, and the density with which it is sampled. Straight rows first, then curves."""
+    """What can be seen to move, and the density with which it is sampled."""
 
-    segments: EdgeSet
-    curves: CurveSet
+    table: EdgeTable
     distribution: EdgeDistribution
-    segment_count: int
 
 
 @dataclass
@@ -64,27 +59,17 @@ class EdgeSample:
 
 
 def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
-    """Edges that can move on the film: of moving shapes, or of all shapes if the camera moves. None: nothing can."""
+    """Edges that can move on the film: of moving shapes, or of all if the camera moves. None: nothing can."""
     facts = job.facts
-    shapes = job.scene.shapes()
-    chosen = [s for s in facts.shapes if s.index >= 0 and (facts.camera_moves or s.moves)]
-    meshes = [s for s in chosen if s.is_mesh]
-    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache)
-    curves = curve_set([(shapes[s.index], s.plugin) for s in chosen if not s.is_mesh])
+    table = edge_table(job, [s for s in facts.shapes if s.index >= 0 and (facts.camera_moves or s.moves)])
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
     weights = []
-    if segments.rows is not None:
-        weights.append(film_weights.segment_weights(segments, frame, border))
-    if curves.rows is not None:
-        weights.append(film_weights.curve_weights(curves, frame, border))
-    if not weights:
-        return None
-    distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
-    if distribution.total <= 0:
-        return None
-    return PrimaryEdges(
-        segments, curves, distribution, dr.width(weights[0]) if segments.rows is not None else 0
-    )
+    if table.has_segments:
+        weights.append(film_weights.segment_weights(table.segments, frame, border))
+    if table.has_curves:
+        weights.append(film_weights.curve_weights(table.curves, frame, border))
+    distribution = distribution_of(weights)
+    return None if distribution is None else PrimaryEdges(table, distribution)
 
 
 @dataclass
@@ -98,24 +83,21 @@ class _Seen:
 
 
 def _edge_point(edges: PrimaryEdges, sample: EdgeSample, frame: SensorFrame) -> _Seen:
-    straight = sample.row < edges.segment_count
+    straight = sample.row < edges.table.segment_count
     local, scale, point = mi.Point3f(0), mi.Float(0), None
-    if edges.segments.rows is not None:
-        point = segment_point(edges.segments, sample.row, sample.t, frame, sample.aperture, straight)
-    if edges.curves.rows is not None:
-        row = sample.row - edges.segment_count
-        on_curve, local, scale = curve_row_point(
-            edges.curves, row, sample.t, frame, sample.aperture, ~straight
-        )
+    if edges.table.has_segments:
+        point = segment_point(edges.table.segments, sample.row, sample.t, frame, sample.aperture, straight)
+    if edges.table.has_curves:
+        row = sample.row - edges.table.segment_count
+        on_curve, local, scale = curve_row_point(edges.table.curves, row, sample.t, frame, sample.aperture, ~straight)
         point = on_curve if point is None else dr.select(straight, point, on_curve)
     return _Seen(point, straight, local, scale)
 
 
 def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSample:
     """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
-    lower, upper = films.sampled_window(job.film)
-    crop = job.film.crop_size()
-    count = job.spp * int(crop[0]) * int(crop[1])
+    lower, upper = frame.window
+    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
     row, t = sample_edge(edges.distribution, stratified(count, rng.next_1d()))
@@ -148,9 +130,9 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
     which, s = index & 1, dr.gather(EdgeSample, sample, index >> 1)
     seen = _edge_point(edges, s, frame)
     side, differs = None, mi.Bool(True)
-    if edges.segments.rows is not None:
-        side, differs = segment_sides(edges.segments, s.row, s.t, seen.point, which, seen.straight)
-    if edges.curves.rows is not None:
+    if edges.table.has_segments:
+        side, differs = segment_sides(edges.table.segments, s.row, s.t, seen.point, which, seen.straight)
+    if edges.table.has_curves:
         beside = curve_sides(seen.point, seen.scale, which)
         side = beside if side is None else dr.select(seen.straight, side, beside)
         differs |= ~seen.straight
@@ -167,7 +149,9 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
         emission = mi.Bool(False)
     L, _, surface = walk(job.scene, rng, ray, pi, job.limits, NoSink(), emission, differs)
     L *= weight
-    alpha = dr.select(surface, mi.Float(1), 0)
+    sky = job.scene.environment() is not None and not job.options.hide_emitters
+    alpha = mi.Float(1) if sky else dr.select(surface, mi.Float(1), 0)
+    alpha += dr.zeros(mi.Float, 2 * n)  # full width, whatever it is made of
     dr.eval(L, alpha, wavelengths)
     return L, alpha, wavelengths
 
@@ -192,21 +176,13 @@ def contribution(job: Job) -> mi.TensorXf | None:
         scale = point.speed / point.view.J_px * sample.inv_pdf
 
     with dr.resume_grad():
-        relative = mi.Vector3f(0)
-        if edges.segments.rows is not None and job.facts.shapes_move:
-            x = segment_motion(edges.segments, sample.row, sample.t, seen.straight)
-            relative += dr.select(seen.straight, x - dr.detach(x), 0)
-        if edges.curves.rows is not None and job.facts.shapes_move:
-            x = curve_motion(edges.curves, sample.row - edges.segment_count, seen.local, ~seen.straight)
-            relative += dr.select(seen.straight, 0, x - dr.detach(x))
+        relative = edge_motion(edges.table, sample.row, sample.t, seen.local)
         if job.facts.camera_moves:
             ray, _ = job.sensor.sample_ray(0, 0.5, point.view.film, sample.aperture)
             u = ray.o + ray.d * dr.detach(dr.dot(point.x - ray.o, ray.d))
             relative -= u - dr.detach(u)
         motion = dr.dot(point.side, relative) * scale
-        return films.develop_boundary(
-            job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid
-        )
+        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -226,4 +202,4 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             return
         dr.set_grad(image, grad_in)
         dr.enqueue(dr.ADMode.Backward, image)
-        dr.traverse(dr.ADMode.Backward)
+        dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)  # other terms need the scene's edges

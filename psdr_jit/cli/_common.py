@@ -30,6 +30,12 @@ def require_positive(**options: float | None) -> None:
             raise OptionError(f"--{name.replace('_', '-')} must be greater than 0, got {value}")
 
 
+def require_seed(seed: int) -> None:
+    """Raise `OptionError` unless Mitsuba's samplers can be seeded with it."""
+    if not 0 <= seed < 2**32:
+        raise OptionError(f"--seed must be from 0 to 2^32 - 1, got {seed}")
+
+
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """The scene and the options that every rendering command has."""
     parser.add_argument("scene", metavar="SCENE.xml", help="Mitsuba scene file")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import _common
+from psdr_jit.errors import OptionError
 
 NAME = "gradient"
 HELP = "differentiate a scene by one of its parameters"
@@ -52,9 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from psdr_jit.gradient import gradient
     from psdr_jit.perturbation import perturb
 
-    exr = images.check_writable(args.output or Path(args.scene).stem + "_gradient.exr").with_suffix(".exr")
-    png = images.check_writable(exr.with_suffix(".png"))
-    images.check_writable(exr)
+    exr, png = outputs(args)
     scene_io.use_variant(args.variant)
     scene = scene_io.load_scene(args.scene, **_common.definitions(args))
     scene_io.check_sensor(scene, args.sensor)
@@ -69,6 +68,17 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         print(describe(result, exr, png))
     return check(args, scene, parameter, integrators.integrator_spec(scene, spec)) if args.check else OK
+
+
+def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
+    """Where the .exr and the .png go; both can be written."""
+    from psdr_jit import images
+
+    named = Path(args.output or Path(args.scene).stem + "_gradient.exr")
+    images.check_writable(named)
+    if named.suffix.lower() not in (".exr", ".png", ""):
+        raise OptionError(f"cannot write '{named}': the name must end in .exr (a .png is written beside it)")
+    return images.check_writable(named.with_suffix(".exr")), images.check_writable(named.with_suffix(".png"))
 
 
 def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:

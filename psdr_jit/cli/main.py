@@ -12,6 +12,9 @@ import importlib
 import os
 import sys
 import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psdr_jit
@@ -91,10 +94,26 @@ def dispatch(argv: list[str], restart: bool) -> int:
     return args.run(args)
 
 
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Show every warning once, as one line of ours instead of a line of source code."""
+    said = set()
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        if str(message) not in said:
+            said.add(str(message))
+            print(f"psdr: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script."""
     try:
-        return dispatch(sys.argv[1:] if argv is None else argv, restart=argv is None)
+        with plain_warnings():
+            return dispatch(sys.argv[1:] if argv is None else argv, restart=argv is None)
     except PsdrError as error:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             traceback.print_exc()

@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render and write; 0."""
     _common.require_positive(spp=args.spp)
+    _common.require_seed(args.seed)
     from psdr_jit import images, scene_io
 
     output = images.check_writable(args.output or Path(args.scene).with_suffix(".exr").name)

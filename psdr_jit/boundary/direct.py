@@ -1,0 +1,201 @@
+"""Direct boundary: shadow edges, where an edge point x_B just lets light from x_S pass to a receiver x_D.
+
+For every emitter point the shadow outline on the receivers is a discontinuity. Sample x_B on an edge (density per length)
+and the emitter from x_B (density per solid angle there), follow the line backwards to x_D, and connect x_D to the sensor:
+
+    − L_e(x_S→x_D) · W · |τ×ω| · n_⊥·[ (v_B − u_D) − (r_B/r_S)(u_S − u_D) ] / pdf
+
+ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the edge's
+material velocity, u_S the emitter point's (the interior term keeps emitter points on their material: `interior.py`),
+u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. [Zhang et al. 2020, Eq. 35] with
+the boundary segment's measure written at x_B. Limits of the same formula: infinitely distant emitters have r_B/r_S = 0,
+and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters replace L_e dω by their intensity over distance².
+Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
+from ..job import Job
+from ..path_steps import PathLimits
+from ..records import Hit
+from ..sensor_frame import SensorFrame, sensor_frame
+from ..streams import Stream, lane_sampler, stream_seed
+from .edge_sources import source_from_curve, source_from_segment
+from .edges import EdgeTable, edge_table, prior_distribution
+from .secondary import BoundarySamples, accumulate_adjoint, derivative_image
+from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
+
+
+@dataclass
+class BoundarySegment:
+    """x_D ← x_B → x_S on one line; detached, one entry per kept sample."""
+
+    row: mi.UInt32
+    t: mi.Float
+    lane: mi.UInt32
+    local: mi.Point3f  # on a curve: x_B in object space
+    x: mi.Point3f  # x_B
+    ω: mi.Vector3f  # from x_D to x_S
+    n: mi.Vector3f  # n_⊥
+    emitter: mi.UInt32  # registry index
+    source: Hit  # x_S as the end of a ray from x_B; no shape unless it lies on an area light
+    receiver: Hit  # x_D as the end of a ray from x_B
+    r: mi.Float  # |x_B − x_D|
+    ratio: mi.Float  # r_B / r_S
+    value: mi.Spectrum  # −L_e |τ×ω| / (pdf · number of samples)
+    wavelengths: mi.Color0f
+
+
+def edges_and_density(job: Job) -> tuple[EdgeTable, EdgeDistribution] | None:
+    """All edges with the prior length × exterior angle; a fixed share for static ones if only shapes move."""
+    chosen = [s for s in job.facts.shapes if s.index >= 0]
+    table = edge_table(job, chosen)
+    weight = None
+    if table.has_segments:
+        rows = table.segments.rows
+        weight = dr.norm(rows.p1 - rows.p0) * rows.angle
+    distribution = prior_distribution(job, table, chosen, weight)
+    return None if distribution is None else (table, distribution)
+
+
+def sample_segments(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistribution) -> BoundarySegment:
+    """Boundary segments that end on a receiver and on a visible emitter; all others are left out (value 0)."""
+    scene = job.scene
+    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
+    lane = dr.arange(mi.UInt32, count)
+    rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_EDGE), lane)
+    row, t = sample_edge(dist, stratified(count, rng.next_1d()))
+    it = dr.zeros(mi.Interaction3f, count)
+    it.wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
+    u = rng.next_2d()
+    straight = row < table.segment_count
+    found = None
+    if table.has_segments:
+        found = source_from_segment(scene, table, row, t, mi.Interaction3f(it), u, straight)
+    if table.has_curves:
+        on_curve = source_from_curve(scene, table, row, t, mi.Interaction3f(it), u, ~straight)
+        found = on_curve if found is None else dr.select(straight, found, on_curve)
+    e, ds = found
+    active = e.valid & (ds.pdf > 0) & dr.any(e.value != 0)
+
+    # Towards the source: closest hit, so that the point on an area light can be attached.
+    on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
+    start = e.x + e.offset * e.n + e.lead * e.ω
+    up = mi.Ray3f(start, e.ω, 0, it.wavelengths)
+    up.maxt = dr.select(on_surface, dr.inf, e.dist - e.lead)
+    pi = scene.ray_intersect_preliminary(up, coherent=False, active=active)
+    reached = pi.is_valid() & (pi.shape.emitter() == ds.emitter)
+    active &= dr.select(on_surface, reached, ~pi.is_valid())
+
+    # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.
+    down = mi.Ray3f(start, -e.ω, 0, it.wavelengths)
+    pd = scene.ray_intersect_preliminary(down, coherent=False, active=active)
+    r = pd.t - e.lead
+    active &= pd.is_valid() & (r > dr.select(straight, e.lead, e.offset))
+
+    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    segment = BoundarySegment(
+        row=row,
+        t=t,
+        lane=lane,
+        local=e.local,
+        x=e.x,
+        ω=e.ω,
+        n=e.n,
+        emitter=dr.reinterpret_array(mi.UInt32, ds.emitter),
+        source=Hit.of(up, pi),
+        receiver=Hit.of(down, pd),
+        r=r,
+        ratio=dr.select(infinite, 0, r / (r + e.dist)),
+        value=-e.value * weight * (e.across / (pmf(dist, row) * count)),
+        wavelengths=it.wavelengths,
+    )
+    return dr.gather(BoundarySegment, segment, dr.compress(active))
+
+
+def record(job: Job, frame: SensorFrame, segment: BoundarySegment) -> SubpathRecords:
+    """Walk every segment's receiver back to the sensor."""
+    longest = job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+    records = SubpathRecords(dr.width(segment.row), longest)
+    rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_SUBPATH), segment.lane)
+    ray = mi.Ray3f(segment.receiver.o, segment.receiver.d, 0, segment.wavelengths)
+    a = -(1 - segment.ratio) * segment.n
+    walk_to_sensor(
+        job.scene,
+        rng,
+        frame,
+        ray,
+        segment.receiver.intersection(),
+        segment.value,
+        a,
+        PathLimits(longest, job.options.rr_depth),
+        records,
+        mi.Bool(True),
+    )
+    dr.eval(records.data)
+    return records
+
+
+def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
+    """Attached −(r_B/r_S) n_⊥·x_S, or −r_B n_⊥·ω for a directional light: what the emitter contributes."""
+    emitter = dr.reinterpret_array(mi.EmitterPtr, segment.emitter)
+    ray = mi.Ray3f(segment.source.o, segment.source.d)
+    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+    si = segment.source.intersection().compute_surface_interaction(ray, flags, segment.source.shape != 0)
+    moved = -segment.ratio * dr.dot(segment.n, si.p)
+    moved = dr.select(segment.source.shape != 0, moved, 0)
+    if job.facts.has_delta_emitters:
+        it = dr.zeros(mi.Interaction3f)
+        it.p = segment.x
+        it.wavelengths = segment.wavelengths
+        delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+        ds, _ = emitter.sample_direction(it, mi.Point2f(0.5), delta)
+        at_infinity = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        # a point's position, or the light's direction as it turns
+        point = -segment.ratio * dr.dot(segment.n, ds.p)
+        turn = -segment.r * dr.dot(segment.n, ds.d)
+        moved += dr.select(delta, dr.select(at_infinity, turn, point), 0)
+    return moved - dr.detach(moved)
+
+
+def _prepared(job: Job) -> BoundarySamples | None:
+    """Sampled, traced and recorded; None if there is nothing to sample."""
+    if job.options.max_depth in (0, 1):
+        return None
+    frame = sensor_frame(job.sensor)
+    chosen = edges_and_density(job)
+    if chosen is None:
+        return None
+    segment = sample_segments(job, frame, *chosen)
+    if dr.width(segment.row) == 0:
+        return None
+    records = record(job, frame, segment)
+    return BoundarySamples(
+        table=chosen[0],
+        row=segment.row,
+        t=segment.t,
+        local=segment.local,
+        n=segment.n,
+        wavelengths=segment.wavelengths,
+        records=records,
+        value=records.data.W,
+        source_motion=lambda: source_motion(job, segment),
+    )
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the direct boundary along the tangents set on the scene's parameters. Detached."""
+    with dr.suspend_grad():
+        return derivative_image(job, _prepared(job))
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate the direct boundary's ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.suspend_grad():
+        accumulate_adjoint(job, _prepared(job), grad_in)

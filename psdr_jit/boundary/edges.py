@@ -1,0 +1,98 @@
+"""Straight edges and analytic curves of a set of shapes as one table with one distribution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..analytic_edges import CurveSet, curve_lengths, curve_set
+from ..edge_distribution import EdgeDistribution, edge_distribution
+from ..edge_set import EdgeSet, edge_set
+from ..job import Job
+from ..scene_analysis import ShapeFacts
+from .edge_points import curve_motion, segment_motion
+
+#: Share of the samples on edges of shapes that do not move, when only shapes move: such an edge counts where a receiver
+#: slides behind it, which few sensor subpaths do.
+STATIC_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class EdgeTable:
+    """Rows of `segments` first, then those of `curves`; either may be absent."""
+
+    segments: EdgeSet
+    curves: CurveSet
+
+    @property
+    def segment_count(self) -> int:
+        return 0 if self.segments.rows is None else dr.width(self.segments.rows.v0)
+
+    @property
+    def has_segments(self) -> bool:
+        return self.segments.rows is not None
+
+    @property
+    def has_curves(self) -> bool:
+        return self.curves.rows is not None
+
+
+def edge_table(job: Job, chosen: list[ShapeFacts]) -> EdgeTable:
+    """Edges of the `chosen` shapes; mesh topologies live in the job's cache."""
+    shapes = job.scene.shapes()
+    meshes = [s for s in chosen if s.is_mesh]
+    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache)
+    curves = curve_set([(shapes[s.index], s.plugin) for s in chosen if not s.is_mesh])
+    return EdgeTable(segments, curves)
+
+
+def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
+    """Distribution over the concatenated weights of straight rows and curve rows; None if all vanish."""
+    if not weights:
+        return None
+    distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
+    return distribution if distribution.total > 0 else None
+
+
+def prior_distribution(
+    job: Job, table: EdgeTable, chosen: list[ShapeFacts], segment_weight: mi.Float | None
+) -> EdgeDistribution | None:
+    """Distribution for boundary segments anywhere in the scene: no viewpoint is known, hence a prior.
+
+    Curves weigh length × π. If only shapes move, edges of static shapes share `STATIC_SHARE` of the samples; if
+    the camera or a light moves, every edge moves relative to something and none is preferred.
+    """
+    weights, moves = [], []
+    if table.has_segments:
+        weights.append(segment_weight)
+        flags = mi.Float([float(s.moves) for s in chosen if s.is_mesh])
+        moves.append(dr.gather(mi.Float, flags, table.segments.rows.shape0))
+    if table.has_curves:
+        weights.append(curve_lengths(table.curves) * dr.pi)
+        flags = mi.Float([float(s.moves) for s in chosen if not s.is_mesh])
+        moves.append(dr.gather(mi.Float, flags, table.curves.rows.shape))
+    if weights and not (job.facts.camera_moves or job.facts.emitters_move):
+        moving = sum(float(dr.sum(w * m)[0]) for w, m in zip(weights, moves, strict=True))
+        static = sum(float(dr.sum(w * (1 - m))[0]) for w, m in zip(weights, moves, strict=True))
+        if moving > 0 and static > 0:
+            share = STATIC_SHARE / (1 - STATIC_SHARE) * moving / static
+            weights = [w * dr.select(m > 0, 1, share) for w, m in zip(weights, moves, strict=True)]
+    return distribution_of(weights)
+
+
+def edge_motion(table: EdgeTable, row: mi.UInt32, t: mi.Float, local: mi.Point3f) -> mi.Vector3f:
+    """Vector of value 0 whose derivative is the material velocity of the edge point, attached.
+
+    `local`: material point of a curve (object space), unused on straight edges.
+    """
+    straight = row < table.segment_count
+    motion = mi.Vector3f(0)
+    if table.has_segments:
+        x = segment_motion(table.segments, row, t, straight)
+        motion += dr.select(straight, x - dr.detach(x), 0)
+    if table.has_curves:
+        x = curve_motion(table.curves, row - table.segment_count, local, ~straight)
+        motion += dr.select(straight, 0, x - dr.detach(x))
+    return motion

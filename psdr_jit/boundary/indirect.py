@@ -1,0 +1,253 @@
+"""Indirect boundary: an edge x_B seen from a surface point x_D that is itself on the way to the sensor.
+
+Sample x_B on an edge and a direction ω in which the edge can matter; the line through it meets the receiver x_D on one
+side and what is seen just past the edge on the other. Measure: edge length × solid angle at x_B.
+
+    (L_− − L_+) · W · |τ×ω| · s·(v_B − u_D) / pdf,        s = τ×ω/|τ×ω|
+
+L_∓ are the radiances that x_D receives from beside the edge on the side −s and +s, *without* what the first vertex emits
+(that is the direct term, in material form), and traced with common random numbers. In the spatial form this covers
+silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the view
+of a sliding x_D. [Zhang et al. 2020, §5.2] with the boundary term two-sided because directions, not points, are kept.
+The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond the first vertex past the edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..analytic_edges import (
+    PIECES,
+    CurveRows,
+    attached_to_world,
+    curve_point,
+    local_viewpoint,
+    transform_point,
+    transform_vector,
+)
+from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
+from ..edge_set import EdgeRows
+from ..job import Job
+from ..path_records import RadianceByDepth
+from ..path_steps import PathLimits, walk
+from ..records import Hit
+from ..sensor_frame import SensorFrame, View, sensor_frame
+from ..streams import Stream, lane_sampler, stream_seed
+from .edge_directions import sample_direction, wedge_measure, wedges
+from .edge_points import (
+    CURVE_LEAD,
+    LEAD,
+    SIDE_OFFSET,
+    EdgePoint,
+    curve_sides,
+    segment_sides,
+)
+from .edges import EdgeTable, edge_table, prior_distribution
+from .secondary import BoundarySamples, accumulate_adjoint, derivative_image
+from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
+
+
+@dataclass
+class EdgeView:
+    """A line through an edge point, with the receiver that sees it; detached, one entry per kept sample."""
+
+    row: mi.UInt32
+    t: mi.Float
+    lane: mi.UInt32
+    local: mi.Point3f  # on a curve: x_B in object space
+    scale: mi.Float  # on a curve: size of the shape
+    x: mi.Point3f  # x_B
+    ω: mi.Vector3f  # from x_D to x_B
+    side: mi.Vector3f  # s
+    receiver: Hit  # x_D as the end of a ray from x_B
+    r: mi.Float  # |x_B − x_D|
+    weight: mi.Spectrum  # |τ×ω| / (pdf · number of samples)
+    wavelengths: mi.Color0f
+
+
+def edges_and_density(job: Job) -> tuple[EdgeTable, EdgeDistribution] | None:
+    """All edges; prior: length × the azimuths in which the edge can matter (`edge_directions`)."""
+    chosen = [s for s in job.facts.shapes if s.index >= 0]
+    table = edge_table(job, chosen)
+    weight = None
+    if table.has_segments:
+        rows = table.segments.rows
+        weight = dr.norm(rows.p1 - rows.p0) * wedge_measure(wedges(rows))
+    distribution = prior_distribution(job, table, chosen, weight)
+    return None if distribution is None else (table, distribution)
+
+
+@dataclass
+class _Line:
+    """A line through an edge point. Detached."""
+
+    x: mi.Point3f
+    local: mi.Point3f
+    scale: mi.Float
+    ω: mi.Vector3f
+    side: mi.Vector3f
+    across: mi.Float  # |dx/dt × ω|
+    pdf_sa: mi.Float
+    lead: mi.Float
+    valid: mi.Bool
+
+
+def _line_on_segment(table: EdgeTable, row, t, u, active) -> _Line:
+    e = dr.gather(EdgeRows, table.segments.rows, row, active)
+    dx = mi.Vector3f(e.p1 - e.p0)
+    x = e.p0 + t * dx
+    ω, pdf = sample_direction(e, u)
+    side = dr.cross(dx, ω)
+    across = dr.norm(side)
+    side = dr.select(across > 0, side / across, 0)
+    lead = LEAD * SIDE_OFFSET * (dr.max(dr.abs(x)) + dr.norm(dx))
+    return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, lead, active & (across > 0) & (pdf > 0))
+
+
+def _line_on_curve(table: EdgeTable, row, t, u, active) -> _Line:
+    """For a contour take the direction first: parallel lines of direction ω touch a surface along one contour."""
+    rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
+    columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
+    ω = mi.warp.square_to_uniform_sphere(u)
+    local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0)))
+    x = transform_point(columns, local.x)
+    outward = transform_vector(columns, local.outward)
+    scale = dr.norm(outward)
+    side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
+    across = dr.norm(side)
+    side = dr.select(across > 0, side / across, 0) * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)
+    valid = active & local.valid & (across > 0)
+    pdf = mi.Float(dr.inv_four_pi)
+    return _Line(x, local.x, scale, ω, side, across, pdf, CURVE_LEAD * scale, valid)
+
+
+def sample_views(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistribution) -> EdgeView:
+    """Lines through edge points that end on a receiver."""
+    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
+    lane = dr.arange(mi.UInt32, count)
+    rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_EDGE), lane)
+    row, t = sample_edge(dist, stratified(count, rng.next_1d()))
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
+    u = rng.next_2d()
+    straight = row < table.segment_count
+    line = None
+    if table.has_segments:
+        line = _line_on_segment(table, row, t, u, straight)
+    if table.has_curves:
+        on_curve = _line_on_curve(table, row, t, u, ~straight)
+        line = on_curve if line is None else dr.select(straight, line, on_curve)
+
+    # A tangent line starts beside a curved surface, not on it.
+    beside = dr.select(straight, 0, SIDE_OFFSET * (dr.max(dr.abs(line.x)) + line.scale))
+    start = line.x + beside * line.side - line.lead * line.ω
+    down = mi.Ray3f(start, -line.ω, 0, wavelengths)
+    pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
+    view = EdgeView(
+        row=row,
+        t=t,
+        lane=lane,
+        local=line.local,
+        scale=line.scale,
+        x=line.x,
+        ω=line.ω,
+        side=line.side,
+        receiver=Hit.of(down, pi),
+        r=pi.t + line.lead,
+        weight=weight * (line.across / (pmf(dist, row) * line.pdf_sa * count)),
+        wavelengths=wavelengths,
+    )
+    return dr.gather(EdgeView, view, dr.compress(line.valid & pi.is_valid()))
+
+
+def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
+    """Radiance from both sides of every edge point, by depth: `(by_depth, final)`, 2 lanes each (−, +)."""
+    n = dr.width(view.row)
+    index = dr.arange(mi.UInt32, 2 * n)
+    which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
+    straight = v.row < table.segment_count
+    seen = View(mi.Point2f(0), mi.Point2f(0), v.x - v.r * v.ω, v.ω, v.r, mi.Float(0), mi.Bool(True))
+    point = EdgePoint(v.x, seen, v.side, mi.Float(1), mi.Bool(True))
+    side, differs = None, mi.Bool(True)
+    if table.has_segments:
+        side, differs = segment_sides(table.segments, v.row, v.t, point, which, straight)
+    if table.has_curves:
+        beside = curve_sides(point, v.scale, which)
+        side = beside if side is None else dr.select(straight, side, beside)
+        differs |= ~straight
+    ray = side.ray
+    ray.wavelengths = v.wavelengths
+    found = job.scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
+    pi = dr.select(side.traced, found, side.pi)
+    rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), v.lane)
+    by_depth = RadianceByDepth(2 * n, vertices)
+    limits = PathLimits(vertices, job.options.rr_depth)
+    final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, mi.Bool(False), differs)
+    dr.eval(final, by_depth.values, by_depth.reached)
+    return by_depth, final
+
+
+def _prepared(job: Job) -> BoundarySamples | None:
+    """Sampled, traced and recorded; None if there is nothing to sample."""
+    max_depth = job.options.max_depth if job.options.max_depth != -1 else 2 * UNLIMITED_VERTICES
+    if max_depth < 3:
+        return None
+    frame = sensor_frame(job.sensor)
+    chosen = edges_and_density(job)
+    if chosen is None:
+        return None
+    table, dist = chosen
+    view = sample_views(job, frame, table, dist)
+    if dr.width(view.row) == 0:
+        return None
+
+    longest = max_depth - 2
+    records = SubpathRecords(dr.width(view.row), longest)
+    ray = mi.Ray3f(view.receiver.o, view.receiver.d, 0, view.wavelengths)
+    walk_to_sensor(
+        job.scene,
+        lane_sampler(stream_seed(job.seed, Stream.INDIRECT_SUBPATH), view.lane),
+        frame,
+        ray,
+        view.receiver.intersection(),
+        view.weight,
+        -view.side,
+        PathLimits(longest, job.options.rr_depth),
+        records,
+        mi.Bool(True),
+    )
+    dr.eval(records.data)
+
+    by_depth, final = _both_sides(job, table, view, max_depth - 1)
+    flat = dr.arange(mi.UInt32, records.lanes * records.depth)
+    lane, left = flat % records.lanes, max_depth - 2 - flat // records.lanes
+    minus, plus = (
+        by_depth.up_to(left, 2 * lane + side, dr.gather(mi.Spectrum, final, 2 * lane + side)) for side in (0, 1)
+    )
+    value = job.rejected.keep_finite(records.data.W * (minus - plus))
+    dr.eval(value)
+    return BoundarySamples(
+        table=table,
+        row=view.row,
+        t=view.t,
+        local=view.local,
+        n=view.side,
+        wavelengths=view.wavelengths,
+        records=records,
+        value=value,
+        source_motion=lambda: mi.Float(0),
+    )
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
+    with dr.suspend_grad():
+        return derivative_image(job, _prepared(job))
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.suspend_grad():
+        accumulate_adjoint(job, _prepared(job), grad_in)

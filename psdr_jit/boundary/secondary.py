@@ -1,0 +1,106 @@
+"""Derivatives of boundary segments found in the middle of a path, written once for the direct and indirect terms.
+
+Each connection of a recorded sensor subpath has a value W (detached) and a motion (attached, primal value 0):
+
+    M_k = n_⊥·v_B + source + Σ_{j<k} g_j^continue·v_j + g_k^connect·v_k + (what is left)·camera ray
+
+Forward mode takes the tangent of every summand at once and sums along the subpath; backward mode turns the film's adjoint
+into one weight per summand by suffix sums. Neither traces a ray, and both are exact transposes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .. import film as films
+from ..job import Job
+from .edges import EdgeTable, edge_motion
+from .sensor_subpath import SubpathRecords
+
+
+@dataclass(frozen=True)
+class BoundarySamples:
+    """Boundary segments with their sensor subpaths. Lanes: segments; flat: vertex-major connections."""
+
+    table: EdgeTable
+    row: mi.UInt32
+    t: mi.Float
+    local: mi.Point3f
+    n: mi.Vector3f  # n_⊥
+    wavelengths: mi.Color0f
+    records: SubpathRecords
+    value: mi.Spectrum  # flat: splatted per unit of motion
+    source_motion: Callable[[], mi.Float]  # attached, per lane, primal value 0
+
+
+@dataclass
+class _Motion:
+    """Attached scalars of primal value 0."""
+
+    segment: mi.Float  # per lane
+    connect: mi.Float  # flat
+    go_on: mi.Float
+    camera: mi.Float
+
+
+def _motion(job: Job, s: BoundarySamples) -> _Motion:
+    at_edge = dr.dot(s.n, edge_motion(s.table, s.row, s.t, s.local)) + s.source_motion()
+    c = s.records.data
+    ray = mi.Ray3f(c.hit.o, c.hit.d)
+    follow = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+    x = c.hit.intersection().compute_surface_interaction(ray, follow, c.hit.shape != 0).p
+    connect, go_on = dr.dot(c.deposit_connect, x), dr.dot(c.deposit_continue, x)
+    camera = mi.Float(0)
+    if job.facts.camera_moves:
+        ray, _ = job.sensor.sample_ray(0, 0.5, c.film, c.aperture)
+        depth = dr.detach(dr.dot(c.hit.o + c.hit.d * c.hit.t - ray.o, ray.d))
+        camera = dr.dot(c.camera, ray.o + depth * ray.d)
+    zero = [value - dr.detach(value) for value in (connect, go_on, camera)]
+    return _Motion(at_edge, *zero)
+
+
+def _splat(job: Job, s: BoundarySamples, motion: mi.Float) -> mi.TensorXf:
+    c = s.records.data
+    wavelengths = s.wavelengths
+    if mi.is_spectral:
+        wavelengths = dr.gather(type(wavelengths), wavelengths, s.records.lane_of())
+    landed = dr.any(s.value != 0)
+    return films.develop_boundary(job.film, c.p, s.value * motion, mi.Float(0), wavelengths, landed)
+
+
+def derivative_image(job: Job, s: BoundarySamples | None) -> mi.TensorXf:
+    """Forward mode: derivative image along the tangents set on the scene's parameters. Detached."""
+    if s is None:
+        return films.black(job.film)
+    with dr.resume_grad():
+        m = _motion(job, s)
+        grads = dr.forward_to(m.segment, m.connect, m.go_on, m.camera, flags=dr.ADFlag.ClearEdges)
+    at_edge, connect, go_on, camera = grads
+    motion = dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
+    return _splat(job, s, job.rejected.keep_finite(mi.Color1f(motion)).x)
+
+
+def accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorXf) -> None:
+    """Backward mode: accumulate ⟨grad_in, dI⟩ into the attached parameters."""
+    if s is None:
+        return
+    with dr.resume_grad():
+        motion = dr.zeros(mi.Float, s.records.lanes * s.records.depth)
+        dr.enable_grad(motion)
+        image = _splat(job, s, motion)
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)
+        δ = dr.grad(motion)
+    δ = job.rejected.keep_finite(mi.Color1f(δ)).x
+    after, total = s.records.after(δ), s.records.total(δ)
+    with dr.resume_grad():
+        m = _motion(job, s)
+        dr.backward_from(
+            dr.sum(total * m.segment) + dr.sum(δ * (m.connect + m.camera) + after * m.go_on),
+            flags=dr.ADFlag.ClearVertices,
+        )

@@ -1,0 +1,205 @@
+"""From a receiving point x_D back to the sensor: importance, and how far its motion carries (motion transport).
+
+A boundary segment found in the middle of a path ends at x_D. Its value counts wherever a path from x_D reaches
+the sensor: directly ("connect") or after more scattering ("continue"). In the spatial form x_D slides when anything on
+that subpath moves,
+
+    u_k = u_{k-1} − ω_k n·(u_{k-1} − v_k)/(n·ω_k),    u_0 = ȯ + tḋ of the camera ray,
+
+with ω_k the direction of travel, away from the sensor, in which vertex k is reached. For one covector a applied to u_D
+the adjoint runs in walking order: deposit g = n (a·ω)/(n·ω) on v, then a ← a − g; what is left acts on the camera ray.
+
+The walk is detached and leaves a record of every vertex: where a connection lands on the film, what it is worth, and both
+deposits (ω differs between "connect" and "continue"). Derivatives are then taken from the records: tangents are prefix
+sums along the walk, adjoints suffix sums.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..path_steps import PathLimits, continue_path
+from ..records import Hit
+from ..sensor_frame import SensorFrame, look_at
+
+#: Vertices of a sensor subpath that are recorded when the depth is unlimited.
+UNLIMITED_VERTICES = 32
+
+
+@dataclass
+class Connection:
+    """One vertex of a sensor subpath and its connection to the sensor. Detached."""
+
+    hit: Hit  # the vertex
+    deposit_connect: mi.Vector3f  # covector on the vertex' material velocity if the path ends here ...
+    deposit_continue: mi.Vector3f  # ... and if it goes on
+    camera: mi.Vector3f  # covector on the camera ray's point, for the connection
+    p: mi.Point2f  # film position [px]
+    film: mi.Point2f  # the same in [0, 1]² of the crop window
+    aperture: mi.Point2f
+    W: mi.Spectrum  # value splatted per unit of motion; 0: no connection
+
+
+def _zero_hit(size: int) -> Hit:
+    return Hit(
+        dr.zeros(mi.Point3f, size),
+        dr.zeros(mi.Vector3f, size),
+        dr.zeros(mi.Float, size),
+        dr.zeros(mi.UInt32, size),
+        dr.zeros(mi.UInt32, size),
+        dr.zeros(mi.Point2f, size),
+    )
+
+
+class SubpathRecords:
+    """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state."""
+
+    def __init__(self, lanes: int, depth: int):
+        size = lanes * depth
+        self.lanes, self.depth = lanes, depth
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.data = Connection(
+            _zero_hit(size),
+            dr.zeros(mi.Vector3f, size),
+            dr.zeros(mi.Vector3f, size),
+            dr.zeros(mi.Vector3f, size),
+            dr.zeros(mi.Point2f, size),
+            dr.zeros(mi.Point2f, size),
+            dr.zeros(mi.Point2f, size),
+            dr.zeros(mi.Spectrum, size),
+        )
+        dr.make_opaque(self.data)
+
+    def write(self, k: mi.UInt32, connection: Connection, active: mi.Bool) -> None:
+        dr.scatter(self.data, connection, k * self.lanes + self.lane, active, mode=dr.ReduceMode.Permute)
+
+    def lane_of(self) -> mi.UInt32:
+        """Subpath of every flat entry."""
+        return dr.arange(mi.UInt32, self.lanes * self.depth) % self.lanes
+
+    def before(self, values: mi.Float) -> mi.Float:
+        """For every vertex the sum of `values` over the earlier vertices of its subpath (flat arrays)."""
+        return _running_sum(self, values, _Flat(self), 0, 1)
+
+    def after(self, values: mi.Float) -> mi.Float:
+        """For every vertex the sum of `values` over the later vertices of its subpath (flat arrays)."""
+        return _running_sum(self, values, _Flat(self), self.depth - 1, -1)
+
+    def total(self, values: mi.Float) -> mi.Float:
+        """Sum of `values` over each subpath, one entry per lane."""
+        first = dr.gather(mi.Float, values, self.lane)
+        return first + dr.gather(mi.Float, self.after(values), self.lane)
+
+
+class _Flat:
+    """A flat output array that a recorded loop scatters into, hidden from its state."""
+
+    def __init__(self, records: SubpathRecords):
+        self.array = dr.zeros(mi.Float, records.lanes * records.depth)
+        dr.make_opaque(self.array)
+
+
+@dr.syntax
+def _running_sum(records: SubpathRecords, values: mi.Float, out: _Flat, start: int, step: int) -> mi.Float:
+    """Exclusive sums along every subpath, from vertex `start` in direction `step`. Detached."""
+    k = mi.Int32(start)
+    done = mi.UInt32(0)
+    total = dr.zeros(mi.Float, records.lanes)
+    while dr.hint(done < records.depth, label="psdr.running_sum"):
+        index = mi.UInt32(k) * records.lanes + records.lane
+        dr.scatter(out.array, total, index)
+        total += dr.gather(mi.Float, values, index)
+        k += step
+        done += 1
+    dr.eval(total, out.array)
+    return out.array
+
+
+def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
+    """Covector n (a·ω)/(n·ω) that a vertex with normal n receives; 0 at exactly grazing incidence."""
+    cos = dr.dot(n, ω)
+    return mi.Vector3f(n) * dr.select(cos != 0, dr.dot(a, ω) / cos, 0)
+
+
+def _adjoint_correction(si: mi.SurfaceInteraction3f, to_sensor: mi.Vector3f) -> mi.Float:
+    """Shading normals make a BSDF asymmetric: factor for particles [Veach 1997, Eq. 5.19], as in Mitsuba's `ptracer`."""
+    out = si.to_local(to_sensor)
+    shading = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, to_sensor)
+    geometric = mi.Frame3f.cos_theta(out) * dr.dot(si.n, si.to_world(si.wi))
+    return dr.select(geometric != 0, dr.abs(shading / geometric), 0)
+
+
+@dr.syntax
+def walk_to_sensor(
+    scene: mi.Scene,
+    sampler,
+    frame: SensorFrame,
+    ray: mi.Ray3f,
+    pi: mi.PreliminaryIntersection3f,
+    β: mi.Spectrum,
+    a: mi.Vector3f,
+    limits: PathLimits,
+    records: SubpathRecords,
+    active: mi.Bool,
+) -> None:
+    """Trace the sensor subpath of x_D = the hit `pi` of `ray`; fills `records`. Detached.
+
+    β: value of the boundary segment over its density; `a`: covector on u_D. `limits.max_depth`: vertices at most.
+    """
+    max_depth, rr_depth = limits.max_depth, limits.rr_depth
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ray = mi.Ray3f(ray)
+    pi = mi.PreliminaryIntersection3f(pi)
+    β = mi.Spectrum(β)
+    a = mi.Vector3f(a)
+    η = mi.Float(1)
+    k = mi.UInt32(0)
+    active = mi.Bool(active)
+    while dr.hint(active, label="psdr.sensor_walk", exclude=[frame]):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        bsdf = si.bsdf()
+
+        aperture = mi.Point2f(0.5)
+        if dr.hint(frame.kind == "thinlens", mode="scalar"):
+            aperture = sampler.next_2d()
+        view = look_at(frame, si.p, aperture)
+        to_sensor = -view.ω
+        wo = si.to_local(to_sensor)
+        lower, upper = frame.window
+        seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
+        f = bsdf.eval(ctx, si, wo, seen) * _adjoint_correction(si, to_sensor)
+        W = β * f / view.J_px
+        seen &= dr.any(W != 0)
+        shadow = si.spawn_ray_to(view.o)
+        seen &= ~scene.ray_test(shadow, seen)
+        g_connect = deposit(a, si.n, view.ω)
+
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        onward = si.to_world(bs.wo)
+        weight *= _adjoint_correction(si, onward)
+        g_continue = deposit(a, si.n, -onward)
+        records.write(
+            k,
+            Connection(
+                Hit.of(ray, pi),
+                g_connect,
+                g_continue,
+                a - g_connect,
+                view.p,
+                view.film,
+                aperture,
+                dr.select(seen, W, 0),
+            ),
+            active,
+        )
+        β, η, alive, _inv = continue_path(sampler, β * weight, η * bs.eta, k + 1, rr_depth)
+        a -= g_continue
+        k += 1
+        active &= alive & (k < max_depth)
+        ray = si.spawn_ray(onward)
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active &= pi.is_valid()

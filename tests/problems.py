@@ -1,0 +1,119 @@
+"""One record per phenomenon: scene file, parameter, direction, and how finite differences are taken of it.
+
+Steps are chosen so that no edge crosses the corner of a pixel block on its way: there an image has a kink, and its
+central difference is not its derivative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A derivative that can be checked. Exactly one of direction, rotate and index, or none for plain values."""
+
+    scene: str  # file name in scenes/, without .xml
+    param: str
+    eps: float  # half step of finite differences, in units of the direction
+    direction: Any = None
+    rotate: Any = None
+    index: int | None = None
+    load: dict = field(default_factory=dict)  # overrides of the scene file's <default> values
+    options: dict = field(default_factory=dict)  # of the integrators on both sides
+    slow: bool = False  # finite differences of it take long: not in the default suite
+    fails: str = ""  # a known defect, by its symptom
+    tag: str = ""  # tells apart problems of one scene and parameter
+
+    @property
+    def id(self) -> str:
+        motion = self.tag or ("rotate" if self.rotate else "move" if self.direction else "value")
+        return f"{self.scene}-{self.param}-{motion}"
+
+    @property
+    def how(self) -> dict:
+        """Keyword arguments of `psdr_jit.perturbation.perturb`."""
+        return {"direction": self.direction, "rotate": self.rotate, "index": self.index}
+
+
+GAUSSIAN = {"rfilter": "gaussian"}
+RGBA = {"pixel_format": "rgba"}
+HIDDEN = {"hide_emitters": True}
+
+PROBLEMS = (
+    # light that moves or changes
+    Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X),
+    Problem("textured_emitter", "card.vertex_positions", 0.004, rotate=(0, 1, 1), slow=True),
+    Problem("textured_emitter", "card.emitter.radiance.data", 0.01),
+    Problem("textured_emitter", "card.vertex_texcoords", 0.01),
+    Problem("coloured_emitter", "card.vertex_color", 0.01),
+    Problem("coloured_emitter", "card.vertex_positions", 0.004, direction=X, slow=True),
+    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=X, slow=True),
+    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=Y),
+    Problem("emitter_mesh", "card.vertex_positions", 0.005, direction=Y, slow=True),
+    Problem("emitter_mesh", "card.vertex_positions", 0.005, rotate=(1, 1, 0), slow=True),
+    Problem("emitter_mesh", "card.vertex_positions", 0.005, index=1, tag="stretch", slow=True),
+    Problem("point_light", "lamp.position", 0.006, direction=X),
+    Problem("spot_light", "lamp.to_world", 0.004, rotate=X, slow=True),
+    Problem("spot_light", "lamp.to_world", 0.004, direction=Y, slow=True),
+    Problem("directional_light", "sun.to_world", 0.004, rotate=Y),
+    Problem("envmap_rotation", "sky.to_world", 0.004, rotate=Y),
+    # shapes that move
+    Problem("lit_box", "box.vertex_positions", 0.005, rotate=Y),
+    Problem("lit_box", "box.vertex_positions", 0.006, direction=X, slow=True),
+    Problem("lit_box", "light.to_world", 0.02, direction=X),
+    Problem("seamed_cube", "cube.vertex_positions", 0.005, rotate=(0, 1, 0.3)),
+    Problem("seamed_cube", "cube.vertex_positions", 0.005, direction=X, slow=True),
+    Problem("seamed_cube", "cube.vertex_positions", 0.005, rotate=Z, load=GAUSSIAN, tag="gaussian", slow=True),
+    Problem("emissive_card", "card.vertex_positions", 0.004, rotate=Z, slow=True),
+    Problem("sphere_silhouette", "ball.to_world", 0.006, direction=X),
+    Problem("sphere_silhouette", "ball.to_world", 0.006, direction=Z, slow=True),
+    Problem("envmap_rotation", "ball.to_world", 0.006, direction=X, slow=True),
+    Problem("disk_rim", "disk.to_world", 0.005, rotate=Y),
+    Problem("cylinder_outline", "tube.to_world", 0.002, rotate=X, slow=True),
+    Problem("cylinder_outline", "tube.to_world", 0.005, direction=Z),
+    Problem("rectangle_moved", "plate.to_world", 0.005, rotate=(1, 1, 0), slow=True),
+    Problem("sliding_texture", "floor.vertex_positions", 0.005, direction=X),
+    Problem("icosphere", "ball.vertex_positions", 0.004, rotate=(1, 1, 0)),
+    Problem("smooth_mesh", "ball.vertex_positions", 0.005, direction=X, slow=True),
+    Problem("two_sided", "tent.vertex_positions", 0.005, rotate=Y, slow=True),
+    # cameras
+    Problem("camera_perspective", "camera.to_world", 0.001, rotate=Y),
+    Problem("camera_perspective", "camera.to_world", 0.004, direction=Z, slow=True),
+    Problem("camera_perspective", "camera.x_fov", 0.05, slow=True),
+    Problem("camera_perspective", "camera.principal_point_offset_x", 0.0005, slow=True),
+    Problem("camera_orthographic", "camera.to_world", 0.005, direction=X),
+    Problem("camera_orthographic", "camera.to_world", 0.0005, rotate=Y, slow=True),
+    Problem("camera_thinlens", "camera.to_world", 0.004, direction=X),
+    Problem("camera_thinlens", "camera.focus_distance", 0.05, slow=True),
+    Problem("camera_thinlens", "camera.aperture_radius", 0.01, slow=True),
+    Problem("camera_crop", "camera.to_world", 0.001, rotate=Y, slow=True),
+    Problem(
+        "camera_crop", "camera.principal_point_offset_x", 0.0005,
+        load={"rfilter": "gaussian", "sample_border": "true"}, tag="gaussian-border", slow=True,
+    ),  # fmt: skip
+    Problem("camera_orthographic_scaled", "camera.to_world", 0.005, direction=X),
+    # materials
+    Problem("sliding_texture", "floor.bsdf.reflectance.data", 0.01),
+    Problem("rough_conductor", "ball.bsdf.alpha.value", 0.004),
+    Problem("rough_conductor", "ball.to_world", 0.006, direction=X, slow=True),
+    Problem("rough_dielectric", "ball.bsdf.alpha.value", 0.004, slow=True),
+    Problem("rough_dielectric", "ball.to_world", 0.006, direction=X, slow=True),
+    # films and options
+    Problem("disk_rim", "disk.to_world", 0.005, direction=X, load=RGBA, tag="alpha-environment"),
+    Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X, load=RGBA, tag="alpha", slow=True),
+    Problem("hidden_emitter", "card.vertex_positions", 0.005, direction=X, load=RGBA, options=HIDDEN),
+    # edges in contact
+    Problem("concave_corner", "camera.to_world", 0.002, direction=X),
+    Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y),
+    Problem("three_sheets", "camera.to_world", 0.002, direction=X),
+    Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z),
+)  # fmt: skip
+
+
+def named(scene: str, param: str, tag: str = "") -> Problem:
+    """The first problem of this scene and parameter."""
+    return next(p for p in PROBLEMS if (p.scene, p.param) == (scene, param) and tag in p.id)
