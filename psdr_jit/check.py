@@ -28,6 +28,8 @@ PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 
 RMS_Z = (0.8, 1.2)      # errors that are honest give 1
 MAX_Z = 6.0
+SETTLED_SEEDS = 96   # from here on the scatter of block means is taken at face value
+SCATTER = "blocks scatter more than their errors"
 MIN_SEEDS = 32          # below, the measured standard errors are too noisy for z-scores
 REFINEMENTS = 2         # how often a failure is re-examined with a quarter of the step
 GROSS = 0.1             # a gain off by more than this is no artefact of the step
@@ -109,14 +111,23 @@ def _decide(slope: Gain, test: BlockTest, d: GroupedImages, f1: GroupedImages, f
                           f"max |z| {test.max_z:.1f}")
         return INCONCLUSIVE, ("finite differences cannot be told from zero; if the gradient ought to vanish, "
                               "give an absolute bound (zero_bound)")
-    return _judge_gain(slope, test, tolerance, max_stderr)
+    return _judge_gain(slope, test, min(d.total, f1.total, f2.total), tolerance, max_stderr)
 
 
-def _judge_gain(slope: Gain, test: BlockTest, tolerance: float, max_stderr: float) -> tuple[str, str]:
+def _slightly_scattered(test: BlockTest) -> bool:
+    """Blocks are off by more than their errors, but not by so much that more seeds could not explain it."""
+    off = test.max_z > MAX_Z or (np.isfinite(test.rms_z) and not RMS_Z[0] <= test.rms_z <= RMS_Z[1])
+    return off and test.max_z <= 2 * MAX_Z and test.rms_z <= 2 * RMS_Z[1]
+
+
+def _judge_gain(slope: Gain, test: BlockTest, seeds: int, tolerance: float, max_stderr: float) -> tuple[str, str]:
     off = abs(slope.value - 1)
     precise = slope.stderr <= max_stderr
     if off > tolerance + (0 if precise else SURE * slope.stderr):
         return FAIL, f"gain is off by {off:.3f}, tolerance {tolerance:g}"
+    if seeds < SETTLED_SEEDS and _slightly_scattered(test):
+        # Standard errors of few, heavy-tailed samples are too small: a bias grows with more seeds, this fades.
+        return INCONCLUSIVE, f"{SCATTER} (RMS z {test.rms_z:.2f}, max |z| {test.max_z:.1f})"
     if test.max_z > MAX_Z:
         return FAIL, f"a block is off by {test.max_z:.1f} standard errors, limit {MAX_Z:g}"
     if not precise:
@@ -219,6 +230,8 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
         if verdict.verdict != INCONCLUSIVE or now >= deadline:
             return verdict, block
         sampler = _most_useful(estimate, reference)
+        if verdict.reason.startswith(SCATTER) and min(estimate.seeds, reference.seeds) < SETTLED_SEEDS:
+            sampler = estimate if estimate.seeds < reference.seeds else reference
         rate = sampler.seconds / sampler.seeds
         # growing batches keep the share of bookkeeping constant, short enough not to miss the deadline
         sampler.add(int(np.clip(min(sampler.seeds // 3, (deadline - now) / rate), 1, 256)))

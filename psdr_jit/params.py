@@ -55,7 +55,7 @@ def _traversed(scene: Any) -> Any:
     return mi.traverse(scene)
 
 
-def _value(params: Any, name: str) -> Any:
+def parameter_value(params: Any, name: str) -> Any:
     """`params[name]`, which fails where a parameter is unset (None), as in the BSDF `hair`."""
     value, kind, node, _ = params.properties[name]
     return None if (value if kind is None else params.get_property(value, kind, node)) is None else params[name]
@@ -71,7 +71,7 @@ def _suggestion(name: str, known: list[str]) -> str:
 
 
 def _describe(params: Any, name: str) -> ParamInfo:
-    value = _value(params, name)
+    value = parameter_value(params, name)
     reason = _obstacle(name, value)
     differentiable = not reason
     if differentiable and name.endswith("vertex_normals"):

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .compat import mesh_positions
+from .params import parameter_value
 from .support import JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
 
 HARD_EDGE = 1e-3
@@ -101,13 +102,6 @@ class SceneGraph:
         """The id given in the scene file, or the plugin and a number."""
         known = node.id()
         return known if known and not known.startswith("_unnamed_") else f"{plugin_name(node)} #{index}"
-
-
-def parameter_value(params, name: str):
-    """`params[name]`, which fails where a parameter of an object is unset (None), as in `hair`."""
-    value, kind, node, _ = params.properties[name]
-    unset = (value if kind is None else params.get_property(value, kind, node)) is None
-    return None if unset else params[name]
 
 
 def _child_objects(node: mi.Object) -> list[mi.Object]:
