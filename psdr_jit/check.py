@@ -123,8 +123,11 @@ def _slightly_scattered(test: BlockTest) -> bool:
 def _judge_gain(slope: Gain, test: BlockTest, seeds: int, tolerance: float, max_stderr: float) -> tuple[str, str]:
     off = abs(slope.value - 1)
     precise = slope.stderr <= max_stderr
-    if off > tolerance + (0 if precise else SURE * slope.stderr):
+    known = slope.stderr <= max_stderr / 2
+    if off > tolerance + (0 if known else SURE * slope.stderr):
         return FAIL, f"gain is off by {off:.3f}, tolerance {tolerance:g}"
+    if precise and off > tolerance:
+        return INCONCLUSIVE, f"gain is off by {off:.3f} +- {slope.stderr:.4f}, not certain to exceed {tolerance:g}"
     if seeds < SETTLED_SEEDS and _slightly_scattered(test):
         # Standard errors of few, heavy-tailed samples are too small: a bias grows with more seeds, this fades.
         return INCONCLUSIVE, f"{SCATTER} (RMS z {test.rms_z:.2f}, max |z| {test.max_z:.1f})"

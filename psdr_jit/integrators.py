@@ -77,7 +77,12 @@ def term_table(plugin: str) -> tuple[tuple[str, str], ...]:
 
 def terms_of(spec: Mapping[str, Any]) -> list[str]:
     """Names of the terms that `spec` renders; empty when its terms cannot be separated."""
-    return [name for name, budget in term_table(spec["type"]) if spec.get(budget, 1) != 0]
+    return [name for name, budget in term_table(spec["type"]) if _budget(spec, budget) != 0]
+
+
+def _budget(spec: Mapping[str, Any], budget: str) -> int:
+    """A term's own samples; `sppd` that is not set follows `sppi`, as in `Options.budget`."""
+    return spec.get(budget, spec.get("sppi", 1) if budget == "sppd" else 1)
 
 
 def build(spec: Mapping[str, Any]) -> Any:
@@ -92,7 +97,7 @@ def build_term(spec: Mapping[str, Any], term: str) -> Any:
     """The integrator that renders `term` alone: every other budget is 0."""
     table = term_table(spec["type"])
     # its own budget is named, so that it does not follow one that is switched off; runtime spp decides anyway
-    budgets = {budget: spec.get(budget, 1) if name == term else 0 for name, budget in table}
+    budgets = {budget: _budget(spec, budget) if name == term else 0 for name, budget in table}
     return build({**spec, **budgets})
 
 

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .ad import tangents
 from .path_records import PathRecords
 from .records import Arrival, Hit, Vertex
 
@@ -72,7 +73,8 @@ def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPt
 def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
     """|dA| of a material point up to a constant factor, attached.
 
-    Meshes: area of the triangle. Their dp_du, dp_dv will not do, a degenerate texture map replaces them by a unit frame.
+    Meshes: area of the triangle. Their dp_du, dp_dv will not do: a degenerate texture map
+    replaces them by a unit frame.
     """
     area = dr.norm(dr.cross(si.dp_du, si.dp_dv))
     on_mesh = active & si.shape.is_mesh()
@@ -172,7 +174,7 @@ def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits:
             dr.set_grad(d, d_grad)
             t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits)
             # x is an input of L: keep the gradients of interior nodes until they have been read
-            L_grad, w_grad, x_grad = dr.forward_to(t.L, t.w, t.x, flags=dr.ADFlag.ClearEdges)
+            L_grad, w_grad, x_grad = tangents(t.L, t.w, t.x)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad
         β_grad = β_grad * dr.detach(t.w) + v.β * w_grad
         o_grad = mi.Vector3f(x_grad)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import film as films
+from .ad import accumulate, tangents
 from .interior import SceneTraits, backward_sweep, forward_sweep
 from .job import Job
 from .path_records import PathRecords
@@ -126,7 +127,7 @@ def forward(job: Job) -> mi.TensorXf:
                 o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
                 if job.facts.camera_moves:
                     with dr.resume_grad():
-                        o_grad, d_grad = dr.forward_to(p.ray.o, p.ray.d, flags=dr.ADFlag.ClearEdges)
+                        o_grad, d_grad = tangents(p.ray.o, p.ray.d)
                     o_grad = o_grad + _skipped(job, p, records) * d_grad
                 recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job.facts))
                 recorded = job.rejected.keep_finite(recorded)
@@ -150,5 +151,5 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():
                     adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
-                    dr.backward_from(adjoint, flags=dr.ADFlag.ClearVertices)  # other terms need the sensor's edges
+                    accumulate(adjoint)  # other terms need the sensor's edges
             dr.eval()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
@@ -33,3 +34,20 @@ class Job:
     @property
     def limits(self) -> PathLimits:
         return PathLimits(self.options.depth_limit, self.options.rr_depth)
+
+
+def passes(job: Job, bytes_per_sample: int) -> Iterator[tuple[float, Job]]:
+    """Split a job so that one part's samples fit into `record_mib`: `(share of the samples, part)`.
+
+    Parts have seeds of their own; the split depends on host data only, so forward and backward mode agree on it.
+    """
+    film = job.film
+    pixels = int(film.crop_size()[0]) * int(film.crop_size()[1])
+    fitting = job.options.record_mib * 2**20 // (bytes_per_sample * pixels)
+    per_pass = max(1, min(job.spp, fitting))
+    done = 0
+    while done < job.spp:
+        spp = min(per_pass, job.spp - done)
+        seed = job.seed if done == 0 else mi.sample_tea_32(mi.UInt32(job.seed), mi.UInt32(done))[0]
+        yield spp / job.spp, replace(job, seed=seed, spp=spp)
+        done += spp

@@ -1,15 +1,17 @@
 """Direct boundary: shadow edges, where an edge point x_B just lets light from x_S pass to a receiver x_D.
 
-For every emitter point the shadow outline on the receivers is a discontinuity. Sample x_B on an edge (density per length)
-and the emitter from x_B (density per solid angle there), follow the line backwards to x_D, and connect x_D to the sensor:
+For every emitter point the shadow outline on the receivers is a discontinuity. Sample x_B on an edge (density per
+length) and the emitter from x_B (density per solid angle there), follow the line backwards to x_D, and connect x_D to
+the sensor:
 
     − L_e(x_S→x_D) · W · |τ×ω| · n_⊥·[ (v_B − u_D) − (r_B/r_S)(u_S − u_D) ] / pdf
 
-ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the edge's
-material velocity, u_S the emitter point's (the interior term keeps emitter points on their material: `interior.py`),
-u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. [Zhang et al. 2020, Eq. 35] with
-the boundary segment's measure written at x_B. Limits of the same formula: infinitely distant emitters have r_B/r_S = 0,
-and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters replace L_e dω by their intensity over distance².
+ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the
+edge's material velocity, u_S the emitter point's (the interior term keeps emitter points on their material:
+`interior.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is the
+boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
+infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
+replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both.
 """
 
@@ -20,15 +22,17 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .. import film as films
 from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
 from ..path_steps import PathLimits
 from ..records import Hit
 from ..sensor_frame import SensorFrame, sensor_frame
 from ..streams import Stream, lane_sampler, stream_seed
+from . import secondary
 from .edge_sources import source_from_curve, source_from_segment
-from .edges import EdgeTable, edge_table, prior_distribution
-from .secondary import BoundarySamples, accumulate_adjoint, derivative_image
+from .edges import EdgeTable, compact, edge_table, prior_distribution
+from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
 
@@ -116,12 +120,17 @@ def sample_segments(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDi
         value=-e.value * weight * (e.across / (pmf(dist, row) * count)),
         wavelengths=it.wavelengths,
     )
-    return dr.gather(BoundarySegment, segment, dr.compress(active))
+    return compact(segment, active)
+
+
+def longest_subpath(job: Job) -> int:
+    """Vertices from the sensor to the receiver, at most: one segment is left for the emitter."""
+    return job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES
 
 
 def record(job: Job, frame: SensorFrame, segment: BoundarySegment) -> SubpathRecords:
     """Walk every segment's receiver back to the sensor."""
-    longest = job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+    longest = longest_subpath(job)
     records = SubpathRecords(dr.width(segment.row), longest)
     rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_SUBPATH), segment.lane)
     ray = mi.Ray3f(segment.receiver.o, segment.receiver.d, 0, segment.wavelengths)
@@ -166,8 +175,6 @@ def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
 
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
-    if job.options.max_depth in (0, 1):
-        return None
     frame = sensor_frame(job.sensor)
     chosen = edges_and_density(job)
     if chosen is None:
@@ -191,11 +198,12 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the direct boundary along the tangents set on the scene's parameters. Detached."""
-    with dr.suspend_grad():
-        return derivative_image(job, _prepared(job))
+    if longest_subpath(job) < 1:
+        return films.black(job.film)
+    return secondary.forward(job, _prepared, longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the direct boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    with dr.suspend_grad():
-        accumulate_adjoint(job, _prepared(job), grad_in)
+    if longest_subpath(job) > 0:
+        secondary.backward(job, _prepared, longest_subpath(job), grad_in)

@@ -1,9 +1,9 @@
 """Directions in which an edge can matter: the lune of silhouettes, and the wedge in which both faces are seen.
 
-Around an edge with tangent τ, measure the azimuth φ of the *viewer's* direction from face 0 through its outer side. Face 1
-lies at φ = π + α, α the signed exterior angle (> 0 convex). In turn come the azimuths
+Around an edge with tangent τ, measure the azimuth φ of the *viewer's* direction from face 0 through its outer side.
+Face 1 lies at φ = π + α, α the signed exterior angle (> 0 convex). In turn come the azimuths
 
-    [0, α)  silhouette     [α, π)  both fronts: a crease     [π, π + α)  silhouette     [π + α, 2π)  inside, or both backs
+    [0, α)  silhouette    [α, π)  both fronts: a crease    [π, π + α)  silhouette    [π + α, 2π)  inside, or both backs
 
 (for α < 0 shifted by α, the silhouettes then lie inside the solid). A border has one face and matters everywhere. The
 polar angle about τ is uniform in its cosine, so pdf_ω = p(φ) / 2 with p piecewise constant.

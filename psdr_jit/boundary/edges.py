@@ -82,6 +82,15 @@ def prior_distribution(
     return distribution_of(weights)
 
 
+def compact(record, active: mi.Bool):
+    """The lanes of `record` (a dataclass of arrays) that are active. Evaluates.
+
+    All fields are evaluated in one kernel first: a gather from pending arrays would launch one for each.
+    """
+    dr.eval(record, active)
+    return dr.gather(type(record), record, dr.compress(active))
+
+
 def edge_motion(table: EdgeTable, row: mi.UInt32, t: mi.Float, local: mi.Point3f) -> mi.Vector3f:
     """Vector of value 0 whose derivative is the material velocity of the edge point, attached.
 

@@ -5,10 +5,11 @@ side and what is seen just past the edge on the other. Measure: edge length × s
 
     (L_− − L_+) · W · |τ×ω| · s·(v_B − u_D) / pdf,        s = τ×ω/|τ×ω|
 
-L_∓ are the radiances that x_D receives from beside the edge on the side −s and +s, *without* what the first vertex emits
-(that is the direct term, in material form), and traced with common random numbers. In the spatial form this covers
-silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the view
-of a sliding x_D. [Zhang et al. 2020, §5.2] with the boundary term two-sided because directions, not points, are kept.
+L_∓ are the radiances that x_D receives from beside the edge on the side −s and +s, *without* what the first vertex
+emits (that is the direct term, in material form), traced with common random numbers. In the spatial form this covers
+silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the
+view of a sliding x_D. It is the boundary integral of [Zhang et al. 2020, §5], two-sided because directions, not
+points, are kept.
 The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond the first vertex past the edge.
 """
 
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .. import film as films
 from ..analytic_edges import (
     PIECES,
     CurveRows,
@@ -36,6 +38,7 @@ from ..path_steps import PathLimits, walk
 from ..records import Hit
 from ..sensor_frame import SensorFrame, View, sensor_frame
 from ..streams import Stream, lane_sampler, stream_seed
+from . import secondary
 from .edge_directions import sample_direction, wedge_measure, wedges
 from .edge_points import (
     CURVE_LEAD,
@@ -45,8 +48,8 @@ from .edge_points import (
     curve_sides,
     segment_sides,
 )
-from .edges import EdgeTable, edge_table, prior_distribution
-from .secondary import BoundarySamples, accumulate_adjoint, derivative_image
+from .edges import EdgeTable, compact, edge_table, prior_distribution
+from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
 
@@ -98,7 +101,7 @@ class _Line:
 def _line_on_segment(table: EdgeTable, row, t, u, active) -> _Line:
     e = dr.gather(EdgeRows, table.segments.rows, row, active)
     dx = mi.Vector3f(e.p1 - e.p0)
-    x = e.p0 + t * dx
+    x = mi.Point3f(e.p0 + t * dx)
     ω, pdf = sample_direction(e, u)
     side = dr.cross(dx, ω)
     across = dr.norm(side)
@@ -113,7 +116,7 @@ def _line_on_curve(table: EdgeTable, row, t, u, active) -> _Line:
     columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
     ω = mi.warp.square_to_uniform_sphere(u)
     local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0)))
-    x = transform_point(columns, local.x)
+    x = mi.Point3f(transform_point(columns, local.x))
     outward = transform_vector(columns, local.outward)
     scale = dr.norm(outward)
     side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
@@ -159,7 +162,7 @@ def sample_views(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistr
         weight=weight * (line.across / (pmf(dist, row) * line.pdf_sa * count)),
         wavelengths=wavelengths,
     )
-    return dr.gather(EdgeView, view, dr.compress(line.valid & pi.is_valid()))
+    return compact(view, line.valid & pi.is_valid())
 
 
 def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
@@ -189,11 +192,13 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     return by_depth, final
 
 
+def longest_subpath(job: Job) -> int:
+    """Vertices from the sensor to the receiver, at most: the edge's side and an emitter take a segment each."""
+    return job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+
+
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
-    max_depth = job.options.max_depth if job.options.max_depth != -1 else 2 * UNLIMITED_VERTICES
-    if max_depth < 3:
-        return None
     frame = sensor_frame(job.sensor)
     chosen = edges_and_density(job)
     if chosen is None:
@@ -203,7 +208,7 @@ def _prepared(job: Job) -> BoundarySamples | None:
     if dr.width(view.row) == 0:
         return None
 
-    longest = max_depth - 2
+    longest = longest_subpath(job)
     records = SubpathRecords(dr.width(view.row), longest)
     ray = mi.Ray3f(view.receiver.o, view.receiver.d, 0, view.wavelengths)
     walk_to_sensor(
@@ -220,9 +225,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
     )
     dr.eval(records.data)
 
-    by_depth, final = _both_sides(job, table, view, max_depth - 1)
+    by_depth, final = _both_sides(job, table, view, longest + 1)
     flat = dr.arange(mi.UInt32, records.lanes * records.depth)
-    lane, left = flat % records.lanes, max_depth - 2 - flat // records.lanes
+    lane, left = flat % records.lanes, longest - flat // records.lanes
     minus, plus = (
         by_depth.up_to(left, 2 * lane + side, dr.gather(mi.Spectrum, final, 2 * lane + side)) for side in (0, 1)
     )
@@ -243,11 +248,12 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
-    with dr.suspend_grad():
-        return derivative_image(job, _prepared(job))
+    if longest_subpath(job) < 1:
+        return films.black(job.film)
+    return secondary.forward(job, _prepared, longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    with dr.suspend_grad():
-        accumulate_adjoint(job, _prepared(job), grad_in)
+    if longest_subpath(job) > 0:
+        secondary.backward(job, _prepared, longest_subpath(job), grad_in)

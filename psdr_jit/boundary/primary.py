@@ -8,8 +8,8 @@ from the sensor to it and s = τ×ω/|τ×ω| the direction across the edge, the
 L_∓ radiance on the side −s and +s, v_B the material velocity of the edge point, u that of the point at x_B's depth
 on the viewing ray of a *fixed* film position (camera motion), and J_px the area perpendicular to ω that one pixel sees
 there. It is the boundary integral of [Zhang et al. 2020, Eq. 21] restricted to the first segment, or the edge integral
-of [Li et al. 2018, Eq. 5], written in world space: only x_B and the camera ray are attached, so pose, field of view, principal point,
-aperture and focus need no code of their own.
+of [Li et al. 2018, Eq. 5], written in world space: only x_B and the camera ray are attached, so pose, field of view,
+principal point, aperture and focus need no code of their own.
 
 The value of the estimator is 0, only its derivative is not. Both sides are traced with the same random numbers.
 """
@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import film as films
+from ..ad import tangents
 from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
 from ..path_steps import NoSink, skip_emitters, walk
@@ -36,7 +37,7 @@ from .edge_points import (
     segment_point,
     segment_sides,
 )
-from .edges import EdgeTable, distribution_of, edge_motion, edge_table
+from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_table
 
 
 @dataclass(frozen=True)
@@ -119,8 +120,7 @@ def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSam
         pi = job.scene.ray_intersect_preliminary(ray, active=active)
         _, pi = skip_emitters(job.scene, ray, pi)
         blocked = pi.is_valid()
-    kept = dr.compress(active & ~blocked)
-    return dr.gather(EdgeSample, sample, kept)
+    return compact(sample, active & ~blocked)
 
 
 def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeSample):
@@ -191,7 +191,7 @@ def forward(job: Job) -> mi.TensorXf:
         image = contribution(job)
         if image is None:
             return films.black(job.film)
-        return dr.forward_to(image, flags=dr.ADFlag.ClearEdges)
+        return tangents(image)
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:

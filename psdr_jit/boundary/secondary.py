@@ -4,8 +4,8 @@ Each connection of a recorded sensor subpath has a value W (detached) and a moti
 
     M_k = n_⊥·v_B + source + Σ_{j<k} g_j^continue·v_j + g_k^connect·v_k + (what is left)·camera ray
 
-Forward mode takes the tangent of every summand at once and sums along the subpath; backward mode turns the film's adjoint
-into one weight per summand by suffix sums. Neither traces a ray, and both are exact transposes.
+Forward mode takes the tangent of every summand at once and sums along the subpath; backward mode turns the film's
+adjoint into one weight per summand by suffix sums. Neither traces a ray, and both are exact transposes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import film as films
-from ..job import Job
+from ..ad import accumulate, tangents
+from ..job import Job, passes
 from .edges import EdgeTable, edge_motion
 from .sensor_subpath import SubpathRecords
 
@@ -35,6 +36,9 @@ class BoundarySamples:
     records: SubpathRecords
     value: mi.Spectrum  # flat: splatted per unit of motion
     source_motion: Callable[[], mi.Float]  # attached, per lane, primal value 0
+
+
+Prepare = Callable[[Job], "BoundarySamples | None"]
 
 
 @dataclass
@@ -72,20 +76,38 @@ def _splat(job: Job, s: BoundarySamples, motion: mi.Float) -> mi.TensorXf:
     return films.develop_boundary(job.film, c.p, s.value * motion, mi.Float(0), wavelengths, landed)
 
 
-def derivative_image(job: Job, s: BoundarySamples | None) -> mi.TensorXf:
-    """Forward mode: derivative image along the tangents set on the scene's parameters. Detached."""
+def forward(job: Job, prepare: Prepare, longest: int) -> mi.TensorXf:
+    """Derivative image along the tangents set on the scene's parameters, in passes that fit into memory. Detached.
+
+    `prepare` samples, traces and records one pass; `longest`: vertices of the longest sensor subpath.
+    """
+    with dr.suspend_grad():
+        parts = passes(job, longest * SubpathRecords.BYTES_RGB)
+        images = [share * _derivative_image(part, prepare(part)) for share, part in parts]
+    return sum(images[1:], images[0])
+
+
+def backward(job: Job, prepare: Prepare, longest: int, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`, same samples."""
+    with dr.suspend_grad():
+        for share, part in passes(job, longest * SubpathRecords.BYTES_RGB):
+            _accumulate_adjoint(part, prepare(part), share * grad_in)
+
+
+def _derivative_image(job: Job, s: BoundarySamples | None) -> mi.TensorXf:
+    """One pass of `forward`."""
     if s is None:
         return films.black(job.film)
     with dr.resume_grad():
         m = _motion(job, s)
-        grads = dr.forward_to(m.segment, m.connect, m.go_on, m.camera, flags=dr.ADFlag.ClearEdges)
+        grads = tangents(m.segment, m.connect, m.go_on, m.camera)
     at_edge, connect, go_on, camera = grads
     motion = dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
     return _splat(job, s, job.rejected.keep_finite(mi.Color1f(motion)).x)
 
 
-def accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorXf) -> None:
-    """Backward mode: accumulate ⟨grad_in, dI⟩ into the attached parameters."""
+def _accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorXf) -> None:
+    """One pass of `backward`."""
     if s is None:
         return
     with dr.resume_grad():
@@ -100,7 +122,4 @@ def accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorXf
     after, total = s.records.after(δ), s.records.total(δ)
     with dr.resume_grad():
         m = _motion(job, s)
-        dr.backward_from(
-            dr.sum(total * m.segment) + dr.sum(δ * (m.connect + m.camera) + after * m.go_on),
-            flags=dr.ADFlag.ClearVertices,
-        )
+        accumulate(dr.sum(total * m.segment) + dr.sum(δ * (m.connect + m.camera) + after * m.go_on))

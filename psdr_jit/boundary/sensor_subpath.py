@@ -9,9 +9,9 @@ that subpath moves,
 with ω_k the direction of travel, away from the sensor, in which vertex k is reached. For one covector a applied to u_D
 the adjoint runs in walking order: deposit g = n (a·ω)/(n·ω) on v, then a ← a − g; what is left acts on the camera ray.
 
-The walk is detached and leaves a record of every vertex: where a connection lands on the film, what it is worth, and both
-deposits (ω differs between "connect" and "continue"). Derivatives are then taken from the records: tangents are prefix
-sums along the walk, adjoints suffix sums.
+The walk is detached and leaves a record of every vertex: where a connection lands on the film, what it is worth, and
+both deposits (ω differs between "connect" and "continue"). Derivatives are then taken from the records: tangents are
+prefix sums along the walk, adjoints suffix sums.
 """
 
 from __future__ import annotations
@@ -56,6 +56,8 @@ def _zero_hit(size: int) -> Hit:
 
 class SubpathRecords:
     """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state."""
+
+    BYTES_RGB = 4 * (10 + 9 + 6 + 3)  # of one vertex
 
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
@@ -125,7 +127,7 @@ def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
 
 
 def _adjoint_correction(si: mi.SurfaceInteraction3f, to_sensor: mi.Vector3f) -> mi.Float:
-    """Shading normals make a BSDF asymmetric: factor for particles [Veach 1997, Eq. 5.19], as in Mitsuba's `ptracer`."""
+    """Shading normals make a BSDF asymmetric: factor for particles [Veach 1997, Eq. 5.19], as in `ptracer`."""
     out = si.to_local(to_sensor)
     shading = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, to_sensor)
     geometric = mi.Frame3f.cos_theta(out) * dr.dot(si.n, si.to_world(si.wi))
