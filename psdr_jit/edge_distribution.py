@@ -14,7 +14,7 @@ class EdgeDistribution:
 
     cdf: mi.Float64  # inclusive cumulative weights, unnormalised
     weight: mi.Float
-    total: float
+    total: mi.Float64  # one entry, evaluated: as a literal it would compile new kernels whenever an edge moves
 
     @property
     def size(self) -> int:
@@ -26,7 +26,9 @@ def edge_distribution(weight: mi.Float) -> EdgeDistribution:
     weight = dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
     cdf = dr.cumsum(mi.Float64(weight))
     dr.eval(weight, cdf)
-    return EdgeDistribution(cdf, weight, float(cdf[dr.width(cdf) - 1]))
+    total = dr.gather(mi.Float64, cdf, dr.width(cdf) - 1)
+    dr.make_opaque(total)
+    return EdgeDistribution(cdf, weight, total)
 
 
 def stratified(count: int, jitter: mi.Float) -> mi.Float64:
@@ -47,4 +49,4 @@ def sample_edge(dist: EdgeDistribution, u: mi.Float64) -> tuple[mi.UInt32, mi.Fl
 
 def pmf(dist: EdgeDistribution, row: mi.UInt32) -> mi.Float:
     """Probability of `row`."""
-    return dr.gather(mi.Float, dist.weight, row) / dist.total
+    return dr.gather(mi.Float, dist.weight, row) / mi.Float(dist.total)

@@ -33,6 +33,7 @@ class PathRecords:
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.lanes, self.depth = lanes, depth
+        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
         self.lane = dr.arange(mi.UInt32, lanes)
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
         self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
@@ -57,15 +58,15 @@ class PathRecords:
 
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex `k` of the active lanes (the sink interface of `path_steps.walk`)."""
-        dr.scatter(self.vertices, vertex, k * self.lanes + self.lane, active, mode=dr.ReduceMode.Permute)
+        dr.scatter(self.vertices, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
     def vertex(self, k: mi.UInt32, active: mi.Bool) -> Vertex:
         """Vertex `k` of every lane; zero where inactive."""
-        return dr.gather(Vertex, self.vertices, k * self.lanes + self.lane, active)
+        return dr.gather(Vertex, self.vertices, k * self.stride + self.lane, active)
 
     def arrival(self, k: mi.UInt32, active: mi.Bool) -> Arrival:
         """Only how vertex `k` was reached, and what its emission counts."""
-        index = k * self.lanes + self.lane
+        index = k * self.stride + self.lane
         v = self.vertices
         return Arrival(
             hit=dr.gather(Hit, v.hit, index, active),
@@ -79,17 +80,18 @@ class RadianceByDepth(NoSink):
 
     def __init__(self, lanes: int, depth: int):
         self.lanes, self.depth = lanes, depth
+        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
         self.lane = dr.arange(mi.UInt32, lanes)
         self.values = dr.zeros(mi.Spectrum, lanes * depth)
         self.reached = dr.zeros(mi.UInt32, lanes)  # entries written, per lane
         dr.make_opaque(self.values, self.reached)
 
     def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
-        dr.scatter(self.values, L, k * self.lanes + self.lane, active)
+        dr.scatter(self.values, L, k * self.stride + self.lane, active)
         dr.scatter(self.reached, k + 1, self.lane, active)
 
     def up_to(self, k: mi.UInt32, lane: mi.UInt32, final: mi.Spectrum) -> mi.Spectrum:
         """Radiance of `lane` with at most `k` segments beyond the first vertex; `final`: of the whole path."""
         stored = k < dr.gather(mi.UInt32, self.reached, lane)
-        value = dr.gather(mi.Spectrum, self.values, k * self.lanes + lane, stored)
+        value = dr.gather(mi.Spectrum, self.values, k * self.stride + lane, stored)
         return dr.select(stored, value, final)

@@ -29,8 +29,8 @@ class SensorFrame:
     kind: str
     to_world: mi.Transform4f
     to_local: mi.Transform4f
-    corner: tuple[float, float]  # film (0, 0) on the plane z = 1 (orthographic: any z)
-    extent: tuple[float, float]  # film width and height there, signed
+    corner: mi.Point2f  # film (0, 0) on the plane z = 1 (orthographic: any z)
+    extent: mi.Point2f  # film width and height there, signed
     near: float
     far: float
     focus: float  # distance of the plane in focus (thin lens)
@@ -41,9 +41,9 @@ class SensorFrame:
     window: tuple[tuple[float, float], tuple[float, float]]  # film region with camera samples [px]
 
     @property
-    def px_area(self) -> float:
+    def px_area(self) -> mi.Float:
         """Area of one pixel on the plane z = 1 (orthographic: on every plane)."""
-        return abs(self.extent[0] * self.extent[1]) / (self.crop_size[0] * self.crop_size[1])
+        return dr.abs(self.extent.x * self.extent.y) / (self.crop_size[0] * self.crop_size[1])
 
 
 @dataclass
@@ -92,8 +92,9 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         kind=kind,
         to_world=to_world,
         to_local=to_local,
-        corner=(x[0], y[0]),
-        extent=(x[1] - x[0], y[2] - y[0]),
+        # opaque: a field of view that changes must not compile new kernels
+        corner=dr.opaque(mi.Point2f, (x[0], y[0])),
+        extent=dr.opaque(mi.Point2f, (x[1] - x[0], y[2] - y[0])),
         near=near[0],
         far=far,
         focus=focus,

@@ -53,7 +53,7 @@ def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
     if not weights:
         return None
     distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
-    return distribution if distribution.total > 0 else None
+    return distribution if float(distribution.total[0]) > 0 else None
 
 
 def prior_distribution(
@@ -77,7 +77,7 @@ def prior_distribution(
         moving = sum(float(dr.sum(w * m)[0]) for w, m in zip(weights, moves, strict=True))
         static = sum(float(dr.sum(w * (1 - m))[0]) for w, m in zip(weights, moves, strict=True))
         if moving > 0 and static > 0:
-            share = STATIC_SHARE / (1 - STATIC_SHARE) * moving / static
+            share = dr.opaque(mi.Float, STATIC_SHARE / (1 - STATIC_SHARE) * moving / static)
             weights = [w * dr.select(m > 0, 1, share) for w, m in zip(weights, moves, strict=True)]
     return distribution_of(weights)
 

@@ -227,7 +227,7 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
     by_depth, final = _both_sides(job, table, view, longest + 1)
     flat = dr.arange(mi.UInt32, records.lanes * records.depth)
-    lane, left = flat % records.lanes, longest - flat // records.lanes
+    lane, left = flat % records.stride, longest - flat // records.stride
     minus, plus = (
         by_depth.up_to(left, 2 * lane + side, dr.gather(mi.Spectrum, final, 2 * lane + side)) for side in (0, 1)
     )

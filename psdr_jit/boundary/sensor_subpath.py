@@ -62,6 +62,7 @@ class SubpathRecords:
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.lanes, self.depth = lanes, depth
+        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
         self.lane = dr.arange(mi.UInt32, lanes)
         self.data = Connection(
             _zero_hit(size),
@@ -76,11 +77,11 @@ class SubpathRecords:
         dr.make_opaque(self.data)
 
     def write(self, k: mi.UInt32, connection: Connection, active: mi.Bool) -> None:
-        dr.scatter(self.data, connection, k * self.lanes + self.lane, active, mode=dr.ReduceMode.Permute)
+        dr.scatter(self.data, connection, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
     def lane_of(self) -> mi.UInt32:
         """Subpath of every flat entry."""
-        return dr.arange(mi.UInt32, self.lanes * self.depth) % self.lanes
+        return dr.arange(mi.UInt32, self.lanes * self.depth) % self.stride
 
     def before(self, values: mi.Float) -> mi.Float:
         """For every vertex the sum of `values` over the earlier vertices of its subpath (flat arrays)."""
@@ -111,7 +112,7 @@ def _running_sum(records: SubpathRecords, values: mi.Float, out: _Flat, start: i
     done = mi.UInt32(0)
     total = dr.zeros(mi.Float, records.lanes)
     while dr.hint(done < records.depth, label="psdr.running_sum"):
-        index = mi.UInt32(k) * records.lanes + records.lane
+        index = mi.UInt32(k) * records.stride + records.lane
         dr.scatter(out.array, total, index)
         total += dr.gather(mi.Float, values, index)
         k += step
