@@ -53,7 +53,7 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
         scene = mi.load_file(os.fspath(path), optimize=False, **{k: str(v) for k, v in defaults.items()})
     except (RuntimeError, UnicodeDecodeError) as error:
         text = _cause(error)
-        by_mesh = "shape plugin" in text or isinstance(error, UnicodeDecodeError)
+        by_mesh = not text or "shape plugin" in text or isinstance(error, UnicodeDecodeError)
         if by_mesh and meshes and not any(mesh in text for mesh in meshes):
             text += f" Is one of its mesh files empty or corrupt: {', '.join(meshes)}?"
         raise SceneError(f"scene file '{path}' cannot be loaded: {text}") from error
