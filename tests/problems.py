@@ -42,6 +42,7 @@ class Problem:
 GAUSSIAN = {"rfilter": "gaussian"}
 RGBA = {"pixel_format": "rgba"}
 HIDDEN = {"hide_emitters": True}
+DEPTH_3 = {"max_depth": 3}
 
 PROBLEMS = (
     # light that moves or changes
@@ -111,6 +112,19 @@ PROBLEMS = (
     Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y),
     Problem("three_sheets", "camera.to_world", 0.002, direction=X),
     Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z),
+    # shadows, and what surfaces see of each other
+    Problem("area_shadow", "blocker.vertex_positions", 0.004, direction=X),
+    Problem("area_shadow", "light.to_world", 0.01, direction=X),
+    Problem("area_shadow", "floor.to_world", 0.005, direction=Y, slow=True),
+    Problem("area_shadow", "camera.to_world", 0.004, direction=X),
+    Problem("area_shadow", "blocker.vertex_positions", 0.004, direction=X, load=DEPTH_3, tag="indirect"),
+    Problem("point_shadow", "blocker.vertex_positions", 0.003, direction=X),
+    Problem("point_shadow", "lamp.position", 0.004, direction=X, slow=True),
+    Problem("directional_shadow", "blocker.to_world", 0.003, direction=X),
+    Problem("directional_shadow", "sun.to_world", 0.002, rotate=Z),
+    Problem("ball_shadow", "blocker.to_world", 0.004, direction=X),
+    Problem("ball_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
+    Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3}),
 )  # fmt: skip
 
 

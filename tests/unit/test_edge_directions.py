@@ -1,0 +1,56 @@
+"""Directions around an edge: the density is the one that is sampled, integrates to one, and covers what can matter."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+COUNT = 1 << 15
+FOUR_PI = 4 * np.pi
+
+
+def rows(shape: str):
+    from psdr_jit.edge_set import edge_set
+
+    to_world = mi.ScalarTransform4f().rotate([1, 2, 3], 40).scale([1, 2, 0.5])
+    mesh = mi.load_dict({"type": shape, "to_world": to_world})
+    return edge_set([mesh], [True], {}).rows
+
+
+def lanes(values, index: int):
+    return dr.gather(type(values), values, dr.full(mi.UInt32, index, COUNT))
+
+
+@pytest.mark.parametrize("shape", ["cube", "rectangle"])
+def test_density_is_what_is_sampled(variant, shape):
+    from psdr_jit.boundary.edge_directions import pdf_direction, sample_direction, wedge_measure, wedges
+
+    table = rows(shape)
+    rng = np.random.default_rng(0)
+    sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.random(COUNT), rng.random(COUNT)))
+    # the lune of a coplanar edge is as thin as rounding
+    matters = np.array((wedge_measure(wedges(table)) > 0) & (table.angle > 1e-3))
+    assert matters.sum() == (12 if shape == "cube" else 4)
+    for index in np.flatnonzero(matters):
+        edge = lanes(table, int(index))
+        ω, pdf = sample_direction(edge, mi.Point2f(rng.random(COUNT), rng.random(COUNT)))
+        assert np.allclose(np.array(dr.norm(ω)), 1, atol=1e-5)
+        agree = np.isclose(np.array(pdf_direction(edge, ω)), np.array(pdf), rtol=1e-4)
+        assert agree.mean() > 0.999  # rounding may put a sample on the other side of a wedge's border
+        mass = np.array(pdf_direction(edge, sphere)) * FOUR_PI
+        assert abs(mass.mean() - 1) <= 6 * mass.std() / np.sqrt(COUNT) + 1e-5
+
+
+def test_a_closed_box_is_not_looked_at_from_inside(variant):
+    """Directions in which both faces of a convex edge show their backs are never drawn."""
+    from psdr_jit.boundary.edge_directions import sample_direction, wedge_measure, wedges
+
+    table = rows("cube")
+    rng = np.random.default_rng(1)
+    index = int(np.flatnonzero(np.array((wedge_measure(wedges(table)) > 0) & (table.angle > 1e-3)))[0])
+    edge = lanes(table, index)
+    ω, _ = sample_direction(edge, mi.Point2f(rng.random(COUNT), rng.random(COUNT)))
+    front0, front1 = np.array(dr.dot(edge.n0, -ω)) > -1e-5, np.array(dr.dot(edge.n1, -ω)) > -1e-5
+    assert (front0 | front1).all() and (front0 & front1).any() and (front0 ^ front1).any()
