@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .. import film as films
 from ..analytic_edges import (
     PIECES,
     CurveRows,
@@ -248,12 +247,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
-    if longest_subpath(job) < 1:
-        return films.black(job.film)
     return secondary.forward(job, _prepared, longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    if longest_subpath(job) > 0:
-        secondary.backward(job, _prepared, longest_subpath(job), grad_in)
+    secondary.backward(job, _prepared, longest_subpath(job), grad_in)

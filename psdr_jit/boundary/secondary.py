@@ -81,6 +81,8 @@ def forward(job: Job, prepare: Prepare, longest: int) -> mi.TensorXf:
 
     `prepare` samples, traces and records one pass; `longest`: vertices of the longest sensor subpath.
     """
+    if longest < 1:
+        return films.black(job.film)
     with dr.suspend_grad():
         parts = passes(job, longest * SubpathRecords.BYTES_RGB)
         images = [share * _derivative_image(part, prepare(part)) for share, part in parts]
@@ -89,6 +91,8 @@ def forward(job: Job, prepare: Prepare, longest: int) -> mi.TensorXf:
 
 def backward(job: Job, prepare: Prepare, longest: int, grad_in: mi.TensorXf) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`, same samples."""
+    if longest < 1:
+        return
     with dr.suspend_grad():
         for share, part in passes(job, longest * SubpathRecords.BYTES_RGB):
             _accumulate_adjoint(part, prepare(part), share * grad_in)

@@ -41,7 +41,7 @@ def choice(tmp_path: Path) -> llvm.Choice:
         ("/usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", 19),
         ("/usr/lib64/libLLVM.so.20.1", 20),
         ("/usr/lib/llvm-18/lib/libLLVM.so.1", 18),
-        ("/home/me/llvm-3/.venv/llvm/libllvm17t64/libLLVM.so.1", 17),
+        ("/opt/llvm-3/.venv/llvm/libllvm17t64/libLLVM.so.1", 17),
         ("/opt/homebrew/Cellar/llvm@18/18.1.8/lib/libLLVM.dylib", 18),
         ("/opt/homebrew/Cellar/llvm/21.1.0/lib/libLLVM.dylib", 21),
         ("/usr/local/lib/libLLVM.so", 0),
