@@ -16,3 +16,10 @@ def tangents(*values):
 def accumulate(value) -> None:
     """Backward-propagate a scalar, leaving the scene's edges in place for the terms that follow."""
     dr.backward_from(value, flags=dr.ADFlag.ClearVertices)
+
+
+def backpropagate(image, grad_in) -> None:
+    """Backward-propagate ⟨grad_in, image⟩, likewise leaving the edges in place."""
+    dr.set_grad(image, grad_in)
+    dr.enqueue(dr.ADMode.Backward, image)
+    dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)

@@ -57,7 +57,6 @@ class _MeshTopology:
     """Cached per mesh: valid while the faces stay the same and welded vertices stay together."""
 
     faces: mi.UInt32  # kept alive, so that its index identifies it
-    vertices: int
     device: EdgeTopologyDevice
     shell: mi.Float  # per edge, see EdgeRows
 
@@ -121,9 +120,7 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dic
     from .scene_checks import warn_about_mesh  # not at the top: the checks stand above the edge sets
 
     warn_about_mesh(mesh.id(), topology)
-    cache[key] = _MeshTopology(
-        buffer, dr.width(positions), upload_topology(topology), mi.Float(edge_shells(topology, p, f))
-    )
+    cache[key] = _MeshTopology(buffer, upload_topology(topology), mi.Float(edge_shells(topology, p, f)))
     return cache[key]
 
 

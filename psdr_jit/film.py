@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .ad import backpropagate
 from .errors import UnsupportedError
 
 #: Quadrature nodes per pixel for the integral of a reconstruction filter.
@@ -57,10 +58,7 @@ def sample_adjoint(
     with dr.resume_grad():
         value = dr.zeros(mi.Spectrum, dr.width(pos))
         dr.enable_grad(value)
-        image = develop_samples(film, pos, value, wavelengths, coalesce)
-        dr.set_grad(image, grad_in)
-        dr.enqueue(dr.ADMode.Backward, image)
-        dr.traverse(dr.ADMode.Backward)
+        backpropagate(develop_samples(film, pos, value, wavelengths, coalesce), grad_in)
         adjoint = dr.grad(value)
     clear(film)
     return adjoint

@@ -9,17 +9,6 @@ from .path_steps import NoSink, shadow_hit
 from .records import Arrival, EmitterSample, Hit, Vertex
 
 
-def _empty_hit(size: int) -> Hit:
-    return Hit(
-        o=dr.empty(mi.Point3f, size),
-        d=dr.empty(mi.Vector3f, size),
-        t=dr.empty(mi.Float, size),
-        shape=dr.empty(mi.UInt32, size),
-        prim_index=dr.empty(mi.UInt32, size),
-        prim_uv=dr.empty(mi.Point2f, size),
-    )
-
-
 class PathRecords:
     """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
 
@@ -38,7 +27,7 @@ class PathRecords:
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
         self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
         self.vertices = Vertex(
-            hit=_empty_hit(size),
+            hit=Hit.made(dr.empty, size),
             β=dr.empty(mi.Spectrum, size),
             weight_emission=dr.empty(mi.Float, size),
             nee=EmitterSample(

@@ -37,7 +37,7 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
 def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
     """Is the emitter sample visible from `si`? Any-hit ray; returns `(hit, visible)` with an empty hit."""
     occluded = scene.ray_test(si.spawn_ray_to(ds.p), active)
-    return dr.zeros(Hit), active & ~occluded
+    return Hit.made(dr.zeros, 1), active & ~occluded
 
 
 def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):

@@ -34,6 +34,18 @@ class Hit:
             prim_uv=mi.Point2f(pi.prim_uv),
         )
 
+    @staticmethod
+    def made(make, size: int) -> Hit:
+        """`size` hits by `make` (`dr.zeros`, `dr.empty`); typed here, as annotations are resolved once per process."""
+        return Hit(
+            o=make(mi.Point3f, size),
+            d=make(mi.Vector3f, size),
+            t=make(mi.Float, size),
+            shape=make(mi.UInt32, size),
+            prim_index=make(mi.UInt32, size),
+            prim_uv=make(mi.Point2f, size),
+        )
+
     def intersection(self) -> mi.PreliminaryIntersection3f:
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = self.shape != 0
@@ -69,9 +81,7 @@ class Vertex:
     β: mi.Spectrum  # throughput before this vertex
     weight_emission: mi.Float  # MIS weight of the emission met here by BSDF sampling
     nee: EmitterSample
-    inv_pdf: (
-        mi.Float
-    )  # 1/(pdf · roulette) of the continuation, 0 where the path ended, negated for a delta lobe
+    inv_pdf: mi.Float  # 1/(pdf · roulette) of the continuation, 0 where the path ended, negated for a delta lobe
 
 
 @dataclass

@@ -25,7 +25,6 @@ class Problem:
     load: dict = field(default_factory=dict)  # overrides of the scene file's <default> values
     options: dict = field(default_factory=dict)  # of the integrators on both sides
     slow: bool = False  # finite differences of it take long: not in the default suite
-    fails: str = ""  # a known defect, by its symptom
     tag: str = ""  # tells apart problems of one scene and parameter
 
     @property

@@ -30,7 +30,7 @@ from ..sensor_frame import SensorFrame, sensor_frame
 from ..streams import Stream, lane_sampler, stream_seed
 from . import secondary
 from .edge_sources import source_from_curve, source_from_segment
-from .edges import EdgeTable, compact, edge_table, prior_distribution
+from .edges import EdgeTable, compact, edges_with_prior
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
@@ -53,18 +53,6 @@ class BoundarySegment:
     ratio: mi.Float  # r_B / r_S
     value: mi.Spectrum  # −L_e |τ×ω| / (pdf · number of samples)
     wavelengths: mi.Color0f
-
-
-def edges_and_density(job: Job) -> tuple[EdgeTable, EdgeDistribution] | None:
-    """All edges with the prior length × exterior angle; a fixed share for static ones if only shapes move."""
-    chosen = [s for s in job.facts.shapes if s.index >= 0]
-    table = edge_table(job, chosen)
-    weight = None
-    if table.has_segments:
-        rows = table.segments.rows
-        weight = dr.norm(rows.p1 - rows.p0) * rows.angle
-    distribution = prior_distribution(job, table, chosen, weight)
-    return None if distribution is None else (table, distribution)
 
 
 def sample_segments(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistribution) -> BoundarySegment:
@@ -175,7 +163,7 @@ def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = sensor_frame(job.sensor)
-    chosen = edges_and_density(job)
+    chosen = edges_with_prior(job, lambda rows: rows.angle)
     if chosen is None:
         return None
     segment = sample_segments(job, frame, *chosen)

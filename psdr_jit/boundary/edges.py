@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,10 +10,10 @@ import mitsuba as mi
 
 from ..analytic_edges import CurveSet, curve_lengths, curve_set
 from ..edge_distribution import EdgeDistribution, edge_distribution
-from ..edge_set import EdgeSet, edge_set
+from ..edge_set import EdgeRows, EdgeSet, edge_set
 from ..job import Job
 from ..scene_analysis import ShapeFacts
-from .edge_points import curve_motion, segment_motion
+from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
 #: Share of the samples on edges of shapes that do not move, when only shapes move: such an edge counts where a receiver
 #: slides behind it, which few sensor subpaths do.
@@ -56,19 +57,21 @@ def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
     return distribution if float(distribution.total[0]) > 0 else None
 
 
-def prior_distribution(
-    job: Job, table: EdgeTable, chosen: list[ShapeFacts], segment_weight: mi.Float | None
-) -> EdgeDistribution | None:
-    """Distribution for boundary segments anywhere in the scene: no viewpoint is known, hence a prior.
+def edges_with_prior(job: Job, per_length: Callable[[EdgeRows], mi.Float]):
+    """All edges of the scene and a distribution for boundary segments anywhere: no viewpoint is known, hence a prior.
 
-    Curves weigh length × π. If only shapes move, edges of static shapes share `STATIC_SHARE` of the samples; if
-    the camera or a light moves, every edge moves relative to something and none is preferred.
+    Straight edges weigh length × `per_length`, curves length × π. If only shapes move, edges of static shapes share
+    `STATIC_SHARE` of the samples; if the camera or a light moves, every edge moves relative to something and none is
+    preferred. Returns `(table, distribution)`, None if nothing can contribute.
     """
+    chosen = [s for s in job.facts.shapes if s.index >= 0]
+    table = edge_table(job, chosen)
     weights, moves = [], []
     if table.has_segments:
-        weights.append(segment_weight)
+        rows = table.segments.rows
+        weights.append(dr.norm(rows.p1 - rows.p0) * per_length(rows))
         flags = mi.Float([float(s.moves) for s in chosen if s.is_mesh])
-        moves.append(dr.gather(mi.Float, flags, table.segments.rows.shape0))
+        moves.append(dr.gather(mi.Float, flags, rows.shape0))
     if table.has_curves:
         weights.append(curve_lengths(table.curves) * dr.pi)
         flags = mi.Float([float(s.moves) for s in chosen if not s.is_mesh])
@@ -79,7 +82,27 @@ def prior_distribution(
         if moving > 0 and static > 0:
             share = dr.opaque(mi.Float, STATIC_SHARE / (1 - STATIC_SHARE) * moving / static)
             weights = [w * dr.select(m > 0, 1, share) for w, m in zip(weights, moves, strict=True)]
-    return distribution_of(weights)
+    distribution = distribution_of(weights)
+    return None if distribution is None else (table, distribution)
+
+
+def sides(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, which, wavelengths):
+    """What lies on side `which` (0: −, 1: +) of edge points: `(ray, pi, differs)`; own faces known, the rest traced.
+
+    `scale`: size of the shape, on curves. `differs` is False where both sides are certainly alike.
+    """
+    straight = row < table.segment_count
+    side, differs = None, mi.Bool(True)
+    if table.has_segments:
+        side, differs = segment_sides(table.segments, row, t, point, which, straight)
+    if table.has_curves:
+        on_curve = curve_sides(point, scale, which)
+        side = on_curve if side is None else dr.select(straight, side, on_curve)
+        differs |= ~straight
+    ray = side.ray
+    ray.wavelengths = wavelengths
+    found = scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
+    return ray, dr.select(side.traced, found, side.pi), differs
 
 
 def compact(record, active: mi.Bool):

@@ -44,10 +44,8 @@ from .edge_points import (
     LEAD,
     SIDE_OFFSET,
     EdgePoint,
-    curve_sides,
-    segment_sides,
 )
-from .edges import EdgeTable, compact, edge_table, prior_distribution
+from .edges import EdgeTable, compact, edges_with_prior, sides
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
@@ -68,18 +66,6 @@ class EdgeView:
     r: mi.Float  # |x_B − x_D|
     weight: mi.Spectrum  # |τ×ω| / (pdf · number of samples)
     wavelengths: mi.Color0f
-
-
-def edges_and_density(job: Job) -> tuple[EdgeTable, EdgeDistribution] | None:
-    """All edges; prior: length × the azimuths in which the edge can matter (`edge_directions`)."""
-    chosen = [s for s in job.facts.shapes if s.index >= 0]
-    table = edge_table(job, chosen)
-    weight = None
-    if table.has_segments:
-        rows = table.segments.rows
-        weight = dr.norm(rows.p1 - rows.p0) * wedge_measure(wedges(rows))
-    distribution = prior_distribution(job, table, chosen, weight)
-    return None if distribution is None else (table, distribution)
 
 
 @dataclass
@@ -169,20 +155,9 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     n = dr.width(view.row)
     index = dr.arange(mi.UInt32, 2 * n)
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
-    straight = v.row < table.segment_count
     seen = View(mi.Point2f(0), mi.Point2f(0), v.x - v.r * v.ω, v.ω, v.r, mi.Float(0), mi.Bool(True))
     point = EdgePoint(v.x, seen, v.side, mi.Float(1), mi.Bool(True))
-    side, differs = None, mi.Bool(True)
-    if table.has_segments:
-        side, differs = segment_sides(table.segments, v.row, v.t, point, which, straight)
-    if table.has_curves:
-        beside = curve_sides(point, v.scale, which)
-        side = beside if side is None else dr.select(straight, side, beside)
-        differs |= ~straight
-    ray = side.ray
-    ray.wavelengths = v.wavelengths
-    found = job.scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
-    pi = dr.select(side.traced, found, side.pi)
+    ray, pi, differs = sides(job.scene, table, v.row, v.t, point, v.scale, which, v.wavelengths)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), v.lane)
     by_depth = RadianceByDepth(2 * n, vertices)
     limits = PathLimits(vertices, job.options.rr_depth)
@@ -199,7 +174,7 @@ def longest_subpath(job: Job) -> int:
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = sensor_frame(job.sensor)
-    chosen = edges_and_density(job)
+    chosen = edges_with_prior(job, lambda rows: wedge_measure(wedges(rows)))
     if chosen is None:
         return None
     table, dist = chosen
@@ -225,8 +200,7 @@ def _prepared(job: Job) -> BoundarySamples | None:
     dr.eval(records.data)
 
     by_depth, final = _both_sides(job, table, view, longest + 1)
-    flat = dr.arange(mi.UInt32, records.lanes * records.depth)
-    lane, left = flat % records.stride, longest - flat // records.stride
+    lane, left = records.lane_of(), longest - records.vertex_of()
     minus, plus = (
         by_depth.up_to(left, 2 * lane + side, dr.gather(mi.Spectrum, final, 2 * lane + side)) for side in (0, 1)
     )

@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import film as films
-from ..ad import tangents
+from ..ad import backpropagate, tangents
 from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
 from ..path_steps import NoSink, skip_emitters, walk
@@ -33,11 +33,9 @@ from .edge_points import (
     VISIBILITY_EPSILON,
     EdgePoint,
     curve_row_point,
-    curve_sides,
     segment_point,
-    segment_sides,
 )
-from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_table
+from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_table, sides
 
 
 @dataclass(frozen=True)
@@ -129,20 +127,9 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
     index = dr.arange(mi.UInt32, 2 * n)
     which, s = index & 1, dr.gather(EdgeSample, sample, index >> 1)
     seen = _edge_point(edges, s, frame)
-    side, differs = None, mi.Bool(True)
-    if edges.table.has_segments:
-        side, differs = segment_sides(edges.table.segments, s.row, s.t, seen.point, which, seen.straight)
-    if edges.table.has_curves:
-        beside = curve_sides(seen.point, seen.scale, which)
-        side = beside if side is None else dr.select(seen.straight, side, beside)
-        differs |= ~seen.straight
-
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    ray = side.ray
-    ray.wavelengths = wavelengths
-    found = job.scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
-    pi = dr.select(side.traced, found, side.pi)
+    ray, pi, differs = sides(job.scene, edges.table, s.row, s.t, seen.point, seen.scale, which, wavelengths)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
         ray, pi = skip_emitters(job.scene, ray, pi)
@@ -200,6 +187,4 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
         image = contribution(job)
         if image is None:
             return
-        dr.set_grad(image, grad_in)
-        dr.enqueue(dr.ADMode.Backward, image)
-        dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)  # other terms need the scene's edges
+        backpropagate(image, grad_in)

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import film as films
-from ..ad import accumulate, tangents
+from ..ad import accumulate, backpropagate, tangents
 from ..job import Job, passes
 from .edges import EdgeTable, edge_motion
 from .sensor_subpath import SubpathRecords
@@ -117,13 +117,11 @@ def _accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorX
     with dr.resume_grad():
         motion = dr.zeros(mi.Float, s.records.lanes * s.records.depth)
         dr.enable_grad(motion)
-        image = _splat(job, s, motion)
-        dr.set_grad(image, grad_in)
-        dr.enqueue(dr.ADMode.Backward, image)
-        dr.traverse(dr.ADMode.Backward)
+        backpropagate(_splat(job, s, motion), grad_in)
         δ = dr.grad(motion)
     δ = job.rejected.keep_finite(mi.Color1f(δ)).x
-    after, total = s.records.after(δ), s.records.total(δ)
+    after = s.records.after(δ)
+    total = s.records.total(δ, after)
     with dr.resume_grad():
         m = _motion(job, s)
         accumulate(dr.sum(total * m.segment) + dr.sum(δ * (m.connect + m.camera) + after * m.go_on))

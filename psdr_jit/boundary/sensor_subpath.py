@@ -43,17 +43,6 @@ class Connection:
     W: mi.Spectrum  # value splatted per unit of motion; 0: no connection
 
 
-def _zero_hit(size: int) -> Hit:
-    return Hit(
-        dr.zeros(mi.Point3f, size),
-        dr.zeros(mi.Vector3f, size),
-        dr.zeros(mi.Float, size),
-        dr.zeros(mi.UInt32, size),
-        dr.zeros(mi.UInt32, size),
-        dr.zeros(mi.Point2f, size),
-    )
-
-
 class SubpathRecords:
     """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state."""
 
@@ -65,7 +54,7 @@ class SubpathRecords:
         self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
         self.lane = dr.arange(mi.UInt32, lanes)
         self.data = Connection(
-            _zero_hit(size),
+            Hit.made(dr.zeros, size),
             dr.zeros(mi.Vector3f, size),
             dr.zeros(mi.Vector3f, size),
             dr.zeros(mi.Vector3f, size),
@@ -83,6 +72,10 @@ class SubpathRecords:
         """Subpath of every flat entry."""
         return dr.arange(mi.UInt32, self.lanes * self.depth) % self.stride
 
+    def vertex_of(self) -> mi.UInt32:
+        """Number on its subpath of every flat entry, 0: the receiver."""
+        return dr.arange(mi.UInt32, self.lanes * self.depth) // self.stride
+
     def before(self, values: mi.Float) -> mi.Float:
         """For every vertex the sum of `values` over the earlier vertices of its subpath (flat arrays)."""
         return _running_sum(self, values, _Flat(self), 0, 1)
@@ -91,10 +84,9 @@ class SubpathRecords:
         """For every vertex the sum of `values` over the later vertices of its subpath (flat arrays)."""
         return _running_sum(self, values, _Flat(self), self.depth - 1, -1)
 
-    def total(self, values: mi.Float) -> mi.Float:
-        """Sum of `values` over each subpath, one entry per lane."""
-        first = dr.gather(mi.Float, values, self.lane)
-        return first + dr.gather(mi.Float, self.after(values), self.lane)
+    def total(self, values: mi.Float, after: mi.Float) -> mi.Float:
+        """Sum of `values` over each subpath, one entry per lane; `after`: what `self.after(values)` returned."""
+        return dr.gather(mi.Float, values, self.lane) + dr.gather(mi.Float, after, self.lane)
 
 
 class _Flat:

@@ -12,14 +12,11 @@ SLOW = dict(seeds=64, spp=64, reference_seeds=256, reference_spp=256, max_stderr
 
 
 def cases(slow: bool) -> list:
-    """All problems for the thorough run, the quick ones for the default; known defects must go on failing."""
+    """All problems for the thorough run, the quick ones for the default."""
     chosen = [p for p in PROBLEMS if slow or not p.slow]
     speed = [pytest.mark.slow] if slow else []
 
-    def broken(p: Problem) -> list:
-        return [pytest.mark.xfail(reason=p.fails, strict=True)] if p.fails else []
-
-    return [pytest.param(p, id=p.id, marks=speed + broken(p)) for p in chosen]
+    return [pytest.param(p, id=p.id, marks=speed) for p in chosen]
 
 
 def compare(p: Problem, seeds, spp, reference_seeds, reference_spp, max_stderr):
