@@ -17,6 +17,9 @@ _PLUGINS = ("psdr_path",)
 def _register(_old: str | None, variant: str | None) -> None:
     if variant is None or "_ad_" not in variant:
         return  # no derivatives in this variant, hence nothing to register
+    base = importlib.import_module("mitsuba.ad.integrators.common")
+    if not issubclass(base.ADIntegrator, mi.Integrator):
+        importlib.reload(base)  # our base class still belongs to the variant it was first imported in
     for name in ("_render", *_PLUGINS):
         full = f"{__name__}.{name}"
         if full in sys.modules:

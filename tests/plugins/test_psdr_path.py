@@ -42,7 +42,9 @@ def test_variants_switch_back_and_forth(llvm):
     for name in ("llvm_ad_spectral", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
         activate(name)
         scene = load(BOX, **SIZE)
-        image = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2}))
+        integrator = mi.load_dict({"type": "psdr_path", "max_depth": 2})
+        assert isinstance(integrator, mi.Integrator)  # of this variant, not of the one before
+        image = derivative(scene, integrator)
         assert image.shape[:2] == (16, 16) and np.abs(image).max() > 0
 
 
