@@ -6,6 +6,7 @@ a cheap first walk without shadow rays finds those paths and only they are recor
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -14,11 +15,13 @@ import mitsuba as mi
 from . import film as films
 from .ad import accumulate, tangents
 from .interior import SceneTraits, backward_sweep, forward_sweep
-from .job import Job
+from .job import Job, passes
+from .low_discrepancy import pixel_sampler
 from .path_records import PathRecords
 from .path_steps import first_hit, walk
+from .scattering import UNIFORM_SHARE
 from .scene_analysis import SceneFacts
-from .streams import Stream, lane_sampler, stream_seed
+from .streams import Stream, stream_seed
 from .touch import count_vertices, touches
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
@@ -37,22 +40,29 @@ class _Pass:
     pos: mi.Point2f
 
 
-def _passes(job: Job):
-    """Split the wavefront so that the records of one pass fit into `record_mib`. Same split in both modes."""
+class _CameraSampler:
+    """What `ADIntegrator.sample_rays` asks of a sampler, with `spp` well-spread samples in every pixel."""
+
+    def __init__(self, seed: mi.UInt32, pixels: int, spp: int):
+        self._lanes = pixel_sampler(seed, dr.arange(mi.UInt32, pixels * spp), spp)
+        self._spp = spp
+        self.next_1d, self.next_2d = self._lanes.next_1d, self._lanes.next_2d
+
+    def sample_count(self) -> int:
+        return self._spp
+
+
+def _camera_passes(job: Job) -> Iterator[_Pass]:
+    """Camera rays, in passes whose path records fit into `record_mib`."""
     film = job.film
     lower, upper = films.sampled_window(film)
     pixels = int((upper - lower).prod())
-    depth = min(job.options.depth_limit, NOMINAL_DEPTH)
-    budget = job.options.record_mib * 2**20 // (PathRecords.BYTES_RGB * max(depth, 1) * pixels)
-    per_pass = max(1, min(job.spp, budget))
-    done = 0
-    while done < job.spp:
-        spp = min(per_pass, job.spp - done)
-        seed = mi.sample_tea_32(stream_seed(job.seed, Stream.CAMERA), mi.UInt32(done))[0]
-        sampler, actual = job.integrator.prepare(job.sensor, seed, spp, [])
+    depth = max(1, min(job.options.depth_limit, NOMINAL_DEPTH))
+    for share, part in passes(job, PathRecords.BYTES_RGB * depth, pixels):
+        films.clear(film)
+        sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
         ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
-        yield _Pass(actual, spp / job.spp, stream_seed(seed, Stream.INTERIOR), ray, weight, pos)
-        done += spp
+        yield _Pass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
 
 
 def every_path_differs(facts: SceneFacts) -> bool:
@@ -77,6 +87,8 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     facts = job.facts
     # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
     limits = replace(job.limits, end_black=not any(s.material for s in facts.shapes))
+    if facts.geometry_moves:
+        limits = replace(limits, uniform_share=UNIFORM_SHARE)
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
@@ -84,7 +96,8 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     dr.eval(ray, lane)
 
     if not every_path_differs(facts):
-        found = touches(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters, touch_table(job))
+        sampler = pixel_sampler(p.seed, lane, p.spp)
+        found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
         if dr.width(lane) == 0:
             return PathRecords(0, 0), lane
@@ -92,10 +105,10 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
 
     depth = limits.max_depth
     if job.options.max_depth == -1:
-        depth = count_vertices(job.scene, lane_sampler(p.seed, lane), ray, limits, job.options.hide_emitters)
+        depth = count_vertices(job.scene, pixel_sampler(p.seed, lane, p.spp), ray, limits, job.options.hide_emitters)
     records = PathRecords(dr.width(lane), depth)
     ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
-    sampler = lane_sampler(p.seed, lane)
+    sampler = pixel_sampler(p.seed, lane, p.spp)
     _, records.count, _ = walk(
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
@@ -120,7 +133,7 @@ def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
     image = 0
     with dr.suspend_grad():
-        for p in _passes(job):
+        for p in _camera_passes(job):
             records, lane = _record(job, p)
             dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
             if dr.width(lane) > 0:
@@ -140,7 +153,7 @@ def forward(job: Job) -> mi.TensorXf:
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
     with dr.suspend_grad():
-        for p in _passes(job):
+        for p in _camera_passes(job):
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue

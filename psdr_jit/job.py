@@ -17,7 +17,7 @@ from .scene_analysis import SceneFacts
 class Job:
     """One term's share of a render call. Host data only; `spp` is the term's own budget."""
 
-    integrator: mi.CppADIntegrator  # provides Mitsuba's `prepare` and `sample_rays`
+    integrator: mi.CppADIntegrator  # provides Mitsuba's `sample_rays`
     scene: mi.Scene
     sensor: mi.Sensor
     facts: SceneFacts
@@ -36,13 +36,14 @@ class Job:
         return PathLimits(self.options.depth_limit, self.options.rr_depth)
 
 
-def passes(job: Job, bytes_per_sample: int) -> Iterator[tuple[float, Job]]:
+def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:
     """Split a job so that one part's samples fit into `record_mib`: `(share of the samples, part)`.
 
-    Parts have seeds of their own; the split depends on host data only, so forward and backward mode agree on it.
+    `pixels`: samples per spp, by default those of the crop window. Parts have seeds of their own; the split depends on
+    host data only, so forward and backward mode agree on it.
     """
-    film = job.film
-    pixels = int(film.crop_size()[0]) * int(film.crop_size()[1])
+    if pixels is None:
+        pixels = int(job.film.crop_size()[0]) * int(job.film.crop_size()[1])
     fitting = job.options.record_mib * 2**20 // (bytes_per_sample * pixels)
     per_pass = max(1, min(job.spp, fitting))
     done = 0

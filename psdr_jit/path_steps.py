@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .records import EmitterSample, Hit, Vertex
+from .scattering import Scattering, mixture_pdf, sample_scattering
 
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
@@ -25,6 +26,7 @@ class PathLimits:
     max_depth: int
     rr_depth: int
     end_black: bool = True  # a throughput of 0 ends the path; not if its derivative is wanted
+    uniform_share: float = 0.0  # of the directions, see `scattering`
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
@@ -101,6 +103,17 @@ def first_hit(scene: mi.Scene, ray: mi.Ray3f, hide_emitters: bool):
     return ray, pi, mi.Bool(False)
 
 
+def _evaluate_and_sample(ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, sampler, share: float, active: mi.Bool):
+    """The BSDF towards an emitter and a direction to go on: `(f cosθ, pdf, Scattering)`."""
+    u_lobe, u = sampler.next_1d(), sampler.next_2d()
+    if share == 0:  # in one virtual call
+        f, pdf, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        return f, pdf, Scattering(bs.wo, bs.pdf, weight, bs.eta, delta)
+    f, pdf = bsdf.eval_pdf(ctx, si, wo, active)
+    return f, mixture_pdf(si, bsdf, wo, pdf, share), sample_scattering(ctx, si, bsdf, u_lobe, u, share, active)
+
+
 @dr.syntax
 def walk(
     scene: mi.Scene,
@@ -120,6 +133,7 @@ def walk(
     """
     # a frozen dataclass cannot be loop state
     max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
+    share = limits.uniform_share
     ctx = mi.BSDFContext()
 
     ray = mi.Ray3f(ray)
@@ -150,14 +164,11 @@ def walk(
         active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, value_em = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
         hit_em, active_em = sink.connect(scene, si, ds, active_em & (ds.pdf > 0))
-        f_em, pdf_bsdf, bs, weight = bsdf.eval_pdf_sample(
-            ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), alive
-        )
+        f_em, pdf_bsdf, bs = _evaluate_and_sample(ctx, si, bsdf, si.to_local(ds.d), sampler, share, alive)
         mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_bsdf))
         L[active_em] += β * mis_em * f_em * value_em
 
-        is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        β_next, η, survives, inv_survival = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        β_next, η, survives, inv_survival = continue_path(sampler, β * bs.weight, η * bs.η, k, rr_depth, end_black)
         alive &= survives & (bs.pdf > 0)
 
         sink.write(
@@ -175,7 +186,7 @@ def walk(
                     t=hit_em.t,
                     weight=dr.select(active_em, mis_em / ds.pdf, 0),
                 ),
-                inv_pdf=dr.select(alive, dr.select(is_delta, -inv_survival, inv_survival) / bs.pdf, 0),
+                inv_pdf=dr.select(alive, dr.select(bs.delta, -inv_survival, inv_survival) / bs.pdf, 0),
             ),
             active,
         )
@@ -183,7 +194,7 @@ def walk(
         β = β_next
         prev = mi.Interaction3f(si)
         prev_pdf = mi.Float(bs.pdf)
-        prev_delta = mi.Bool(is_delta)
+        prev_delta = mi.Bool(bs.delta)
         emission = mi.Bool(True)
         k += 1
         ray = si.spawn_ray(si.to_world(bs.wo))

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .path_steps import PathLimits, continue_path, first_hit
+from .scattering import sample_scattering
 
 
 @dr.syntax
@@ -21,6 +22,7 @@ def touches(
     """
     # a frozen dataclass cannot be loop state
     max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
+    share = limits.uniform_share
     ray, pi, _emission = first_hit(scene, ray, hide_emitters)
     found = mi.Bool(False)
     β = mi.Spectrum(1)
@@ -31,8 +33,9 @@ def touches(
         found |= dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, pi.shape), active) != 0
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         sampler.next_2d()  # spent on emitter sampling in `walk`
-        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-        β, η, alive, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        u_lobe, u = sampler.next_1d(), sampler.next_2d()
+        bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), u_lobe, u, share, active)
+        β, η, alive, _weight = continue_path(sampler, β * bs.weight, η * bs.η, k, rr_depth, end_black)
         alive &= bs.pdf > 0
         k += 1
         active = alive & ~found & (k + 1 < max_depth)
@@ -45,7 +48,7 @@ def touches(
 @dr.syntax
 def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool) -> int:
     """Largest number of vertices among the paths that `walk` would trace (evaluates; unlimited depth only)."""
-    rr_depth, end_black = limits.rr_depth, limits.end_black
+    rr_depth, end_black, share = limits.rr_depth, limits.end_black, limits.uniform_share
     ray, pi, _emission = first_hit(scene, ray, hide_emitters)
     β = mi.Spectrum(1)
     η = mi.Float(1)
@@ -54,8 +57,9 @@ def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, 
     while dr.hint(active, label="psdr.count_vertices"):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         sampler.next_2d()
-        bs, weight = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
-        β, η, active, _weight = continue_path(sampler, β * weight, η * bs.eta, k, rr_depth, end_black)
+        u_lobe, u = sampler.next_1d(), sampler.next_2d()
+        bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), u_lobe, u, share, active)
+        β, η, active, _weight = continue_path(sampler, β * bs.weight, η * bs.η, k, rr_depth, end_black)
         active &= bs.pdf > 0
         k += 1
         ray = si.spawn_ray(si.to_world(bs.wo))

@@ -48,7 +48,7 @@ PROBLEMS = (
     Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X),
     Problem("textured_emitter", "card.vertex_positions", 0.004, rotate=(0, 1, 1), slow=True),
     Problem("textured_emitter", "card.emitter.radiance.data", 0.01),
-    Problem("textured_emitter", "card.vertex_texcoords", 0.01),
+    Problem("textured_emitter", "card.vertex_texcoords", 0.003),
     Problem("coloured_emitter", "card.vertex_color", 0.01),
     Problem("coloured_emitter", "card.vertex_positions", 0.004, direction=X, slow=True),
     Problem("emitter_sphere", "bulb.to_world", 0.005, direction=X, slow=True),

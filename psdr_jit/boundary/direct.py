@@ -22,15 +22,19 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
+from ..edge_distribution import pmf, sample_edge, stratified
+from ..edge_set import EdgeRows
 from ..job import Job
+from ..low_discrepancy import lane_sampler
 from ..path_steps import PathLimits
 from ..records import Hit
 from ..sensor_frame import SensorFrame, sensor_frame
-from ..streams import Stream, lane_sampler, stream_seed
+from ..streams import Stream, stream_seed
 from . import secondary
+from .edge_directions import silhouette_wedges, wedge_measure
 from .edge_sources import source_from_curve, source_from_segment
-from .edges import EdgeTable, compact, edges_with_prior
+from .edges import compact
+from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
@@ -55,8 +59,9 @@ class BoundarySegment:
     wavelengths: mi.Color0f
 
 
-def sample_segments(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistribution) -> BoundarySegment:
+def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> BoundarySegment:
     """Boundary segments that end on a receiver and on a visible emitter; all others are left out (value 0)."""
+    table, dist = edges.table, edges.distribution
     scene = job.scene
     count = job.spp * frame.crop_size[0] * frame.crop_size[1]
     lane = dr.arange(mi.UInt32, count)
@@ -68,9 +73,9 @@ def sample_segments(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDi
     straight = row < table.segment_count
     found = None
     if table.has_segments:
-        found = source_from_segment(scene, table, row, t, mi.Interaction3f(it), u, straight)
+        found = source_from_segment(scene, edges, row, t, mi.Interaction3f(it), u, straight)
     if table.has_curves:
-        on_curve = source_from_curve(scene, table, row, t, mi.Interaction3f(it), u, ~straight)
+        on_curve = source_from_curve(scene, edges, row, t, mi.Interaction3f(it), u, ~straight)
         found = on_curve if found is None else dr.select(straight, found, on_curve)
     e, ds = found
     active = e.valid & (ds.pdf > 0) & dr.any(e.value != 0)
@@ -160,18 +165,23 @@ def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
     return moved - dr.detach(moved)
 
 
+def _shadow_weight(job: Job, rows: EdgeRows) -> mi.Float:
+    """Weight per length: the lune in which the edge is a silhouette, if a light can see it as one."""
+    return dr.select(can_cast_shadow(job, rows), wedge_measure(silhouette_wedges(rows)), 0)
+
+
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = sensor_frame(job.sensor)
-    chosen = edges_with_prior(job, lambda rows: rows.angle)
-    if chosen is None:
+    edges = secondary_edges(job, lambda rows: _shadow_weight(job, rows), lights_count=True)
+    if edges is None:
         return None
-    segment = sample_segments(job, frame, *chosen)
+    segment = sample_segments(job, frame, edges)
     if dr.width(segment.row) == 0:
         return None
     records = record(job, frame, segment)
     return BoundarySamples(
-        table=chosen[0],
+        table=edges.table,
         row=segment.row,
         t=segment.t,
         local=segment.local,

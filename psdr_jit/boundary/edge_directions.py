@@ -7,6 +7,9 @@ Face 1 lies at φ = π + α, α the signed exterior angle (> 0 convex). In turn 
 
 (for α < 0 shifted by α, the silhouettes then lie inside the solid). A border has one face and matters everywhere. The
 polar angle about τ is uniform in its cosine, so pdf_ω = p(φ) / 2 with p piecewise constant.
+
+An edge of a shape that rests matters where its viewer is on something that moves: half of its directions are uniform
+in the cone from which the ball around all movers is seen (one-sample balance heuristic [Veach 1997, §9.2.4]).
 """
 
 from __future__ import annotations
@@ -18,6 +21,9 @@ import mitsuba as mi
 
 from ..edge_set import EdgeRows
 from .film_weights import FULL_CREASE
+
+#: Share of the directions of a resting edge that lead to the movers.
+CONE_SHARE = 0.5
 
 #: Relative density of the crease wedge for seams that have no angle (textures, split normals).
 SEAM_DENSITY = 0.25
@@ -66,9 +72,15 @@ def _azimuth_density(w: Wedges, φ: mi.Float) -> mi.Float:
     return dr.select(local < w.α, w.silhouette, dr.select(first_half, w.front, w.back))
 
 
-def sample_direction(e: EdgeRows, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """Direction ω from the viewer's side through the edge, and its density per solid angle: `(ω, pdf_sa)`."""
+def silhouette_wedges(e: EdgeRows) -> Wedges:
+    """Where edge rows `e` can be a silhouette; a border is one from everywhere."""
     w = wedges(e)
+    anywhere = e.border | e.traced
+    return Wedges(w.start, w.α, w.silhouette, dr.select(anywhere, 1.0, 0.0), dr.select(anywhere, 1.0, 0.0))
+
+
+def sample_direction(e: EdgeRows, w: Wedges, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+    """Direction ω from the viewer's side through the edge, and its density per solid angle: `(ω, pdf_sa)`."""
     lengths = [w.α, dr.pi - w.α, w.α, dr.pi - w.α]
     densities = [w.silhouette, w.front, w.silhouette, w.back]
     total = wedge_measure(w)
@@ -91,11 +103,59 @@ def sample_direction(e: EdgeRows, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]
     return -mi.Vector3f(viewer), pdf
 
 
-def pdf_direction(e: EdgeRows, ω: mi.Vector3f) -> mi.Float:
+def pdf_direction(e: EdgeRows, w: Wedges, ω: mi.Vector3f) -> mi.Float:
     """Density per solid angle of `sample_direction`."""
-    w = wedges(e)
     τ = dr.normalize(mi.Vector3f(e.p1 - e.p0))
     φ = dr.atan2(dr.dot(-ω, e.n0), dr.dot(-ω, dr.cross(e.n0, τ))) - w.start
     φ = dr.select(φ < 0, φ + dr.two_pi, φ)
     total = wedge_measure(w)
     return dr.select(total > 0, _azimuth_density(w, φ) / (2 * total), 0)
+
+
+@dataclass
+class Cone:
+    """Directions within an angle of an axis; detached."""
+
+    axis: mi.Vector3f
+    open: mi.Float  # 1 − cos of the angle; 2: all directions
+
+    @property
+    def share(self) -> mi.Float:
+        """Of all directions."""
+        return self.open / 2
+
+    def sample(self, u: mi.Point2f) -> mi.Vector3f:
+        rise = u.x * self.open
+        sin, cos = dr.sincos(dr.two_pi * u.y)
+        radius = dr.safe_sqrt(rise * (2 - rise))
+        return mi.Frame3f(self.axis).to_world(mi.Vector3f(radius * cos, radius * sin, 1 - rise))
+
+    def pdf(self, d: mi.Vector3f) -> mi.Float:
+        inside = dr.squared_norm(d - self.axis) / 2 <= self.open
+        return dr.select(inside, dr.inv_two_pi / self.open, 0)
+
+
+def towards_sphere(x: mi.Point3f, centre: mi.Point3f, radius: mi.Float) -> Cone:
+    """Directions from x to a ball; all of them from inside."""
+    offset = mi.Vector3f(centre - x)
+    dist2 = dr.squared_norm(offset)
+    sin2 = dr.square(radius) / dist2
+    outside = sin2 < 1
+    axis = dr.select(outside, offset * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
+    return Cone(axis, dr.select(outside, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2))
+
+
+def sample_view(e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+    """As `sample_direction`, with the mixture for edges that rest: `(ω, pdf_sa)`."""
+    into_cone = rests & (u.x < CONE_SHARE)
+    rescaled = dr.select(into_cone, u.x / CONE_SHARE, (u.x - CONE_SHARE) / (1 - CONE_SHARE))
+    u = mi.Point2f(dr.select(rests, rescaled, u.x), u.y)
+    ω, _ = sample_direction(e, w, u)
+    ω = dr.select(into_cone, -cone.sample(u), ω)
+    return ω, pdf_view(e, w, cone, rests, ω)
+
+
+def pdf_view(e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, ω: mi.Vector3f) -> mi.Float:
+    """Density per solid angle of `sample_view`."""
+    pdf = pdf_direction(e, w, ω)
+    return dr.select(rests, CONE_SHARE * cone.pdf(-ω) + (1 - CONE_SHARE) * pdf, pdf)

@@ -18,8 +18,12 @@ from ..analytic_edges import (
     transform_vector,
 )
 from ..edge_set import EdgeRows
+from .edge_directions import pdf_direction, pdf_view, sample_direction, sample_view, silhouette_wedges
 from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET
-from .edges import EdgeTable
+from .relevance import SecondaryEdges
+
+#: Share of the samples under a sky whose direction follows the edge instead of the emitter.
+EDGE_SHARE = 0.5
 
 
 @dataclass
@@ -38,13 +42,21 @@ class EdgeAndSource:
     valid: mi.Bool
 
 
-def source_from_segment(scene, table: EdgeTable, row, t, it, u, active) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
-    """The emitter is sampled from the edge point; the edge must be a silhouette for that direction."""
-    e = dr.gather(EdgeRows, table.segments.rows, row, active)
+def source_from_segment(
+    scene, edges: SecondaryEdges, row, t, it, u, active
+) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
+    """The emitter is sampled from the edge point; the edge must be a silhouette for that direction.
+
+    Under a sky, half of the samples take a direction in which the edge is a silhouette (`_from_edge_or_sky`).
+    """
+    e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
     dx = mi.Vector3f(e.p1 - e.p0)
     length = dr.norm(dx)
     it.p = e.p0 + t * dx
-    ds, value = scene.sample_emitter_direction(it, u, False, active)
+    if scene.environment() is None:
+        ds, value = scene.sample_emitter_direction(it, u, False, active)
+    else:
+        ds, value = _from_edge_or_sky(scene, edges, e, row, it, u, active)
     side = dr.cross(dx, ds.d)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)
@@ -58,11 +70,51 @@ def source_from_segment(scene, table: EdgeTable, row, t, it, u, active) -> tuple
     return out, ds
 
 
-def source_from_curve(scene, table: EdgeTable, row, t, it, u, active) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
+def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, active):
+    """Emitter sampling and directions that suit the edge, in equal parts: `(ds, L_e / pdf)`.
+
+    A sky is seen in every direction, so the edge's own density serves as well as the emitter's: balance heuristic of
+    both for samples of the sky [Veach 1997, §9.2.2]. Other emitters are left to emitter sampling.
+    """
+    sky = scene.environment()
+    by_edge = u.x < EDGE_SHARE
+    u = mi.Point2f(dr.select(by_edge, u.x / EDGE_SHARE, (u.x - EDGE_SHARE) / (1 - EDGE_SHARE)), u.y)
+    ds, value = scene.sample_emitter_direction(it, u, False, active & ~by_edge)
+
+    w = silhouette_wedges(e)
+    rests, cone = mi.Bool(False), None
+    if edges.movers is None:
+        ω, _ = sample_direction(e, w, u)
+    else:
+        rests, cone = edges.rests(row, active), edges.movers.seen_from(it.p)
+        ω, _ = sample_view(e, w, cone, rests, u)
+    free = dr.zeros(mi.DirectionSample3f, dr.width(ω))
+    free.d, free.dist = ω, dr.opaque(mi.Float, 2 * scene.bbox().bounding_sphere().radius)
+    free.p = it.p + free.dist * ω
+    free.emitter = dr.select(by_edge, mi.EmitterPtr(sky), ds.emitter)
+    ds = dr.select(by_edge, free, ds)
+
+    from_sky = active & (ds.emitter == mi.EmitterPtr(sky))
+    pdf_em = scene.pdf_emitter_direction(it, ds, from_sky)
+    pdf_edge = pdf_direction(e, w, ds.d) if cone is None else pdf_view(e, w, cone, rests, ds.d)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = -ds.d
+    si.wavelengths = it.wavelengths
+    L = sky.eval(si, from_sky)
+    pdf = EDGE_SHARE * pdf_edge + (1 - EDGE_SHARE) * pdf_em
+    ds.pdf = dr.select(from_sky, pdf, (1 - EDGE_SHARE) * ds.pdf)
+    value = dr.select(from_sky, dr.select(pdf > 0, L / pdf, 0), value / (1 - EDGE_SHARE))
+    return ds, value
+
+
+def source_from_curve(
+    scene, edges: SecondaryEdges, row, t, it, u, active
+) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
     """A contour depends on where it is seen from: the emitter is sampled from the shape's centre first.
 
     The density then is per solid angle at the centre; carried over to the contour point by dω = cosθ dA / r².
     """
+    table = edges.table
     rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
     centre = transform_point(columns, curve_centre(rows.kind))

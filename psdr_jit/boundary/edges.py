@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from ..analytic_edges import CurveSet, curve_lengths, curve_set
+from ..analytic_edges import CurveSet, curve_set
 from ..edge_distribution import EdgeDistribution, edge_distribution
-from ..edge_set import EdgeRows, EdgeSet, edge_set
+from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..scene_analysis import ShapeFacts
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
-
-#: Share of the samples on edges of shapes that do not move, when only shapes move: such an edge counts where a receiver
-#: slides behind it, which few sensor subpaths do.
-STATIC_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -55,35 +50,6 @@ def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
         return None
     distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
     return distribution if float(distribution.total[0]) > 0 else None
-
-
-def edges_with_prior(job: Job, per_length: Callable[[EdgeRows], mi.Float]):
-    """All edges of the scene and a distribution for boundary segments anywhere: no viewpoint is known, hence a prior.
-
-    Straight edges weigh length × `per_length`, curves length × π. If only shapes move, edges of static shapes share
-    `STATIC_SHARE` of the samples; if the camera or a light moves, every edge moves relative to something and none is
-    preferred. Returns `(table, distribution)`, None if nothing can contribute.
-    """
-    chosen = [s for s in job.facts.shapes if s.index >= 0]
-    table = edge_table(job, chosen)
-    weights, moves = [], []
-    if table.has_segments:
-        rows = table.segments.rows
-        weights.append(dr.norm(rows.p1 - rows.p0) * per_length(rows))
-        flags = mi.Float([float(s.moves) for s in chosen if s.is_mesh])
-        moves.append(dr.gather(mi.Float, flags, rows.shape0))
-    if table.has_curves:
-        weights.append(curve_lengths(table.curves) * dr.pi)
-        flags = mi.Float([float(s.moves) for s in chosen if not s.is_mesh])
-        moves.append(dr.gather(mi.Float, flags, table.curves.rows.shape))
-    if weights and not (job.facts.camera_moves or job.facts.emitters_move):
-        moving = sum(float(dr.sum(w * m)[0]) for w, m in zip(weights, moves, strict=True))
-        static = sum(float(dr.sum(w * (1 - m))[0]) for w, m in zip(weights, moves, strict=True))
-        if moving > 0 and static > 0:
-            share = dr.opaque(mi.Float, STATIC_SHARE / (1 - STATIC_SHARE) * moving / static)
-            weights = [w * dr.select(m > 0, 1, share) for w, m in zip(weights, moves, strict=True)]
-    distribution = distribution_of(weights)
-    return None if distribution is None else (table, distribution)
 
 
 def sides(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, which, wavelengths):

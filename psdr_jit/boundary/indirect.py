@@ -29,23 +29,25 @@ from ..analytic_edges import (
     transform_point,
     transform_vector,
 )
-from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
+from ..edge_distribution import pmf, sample_edge, stratified
 from ..edge_set import EdgeRows
 from ..job import Job
+from ..low_discrepancy import lane_sampler
 from ..path_records import RadianceByDepth
 from ..path_steps import PathLimits, walk
 from ..records import Hit
 from ..sensor_frame import SensorFrame, View, sensor_frame
-from ..streams import Stream, lane_sampler, stream_seed
+from ..streams import Stream, stream_seed
 from . import secondary
-from .edge_directions import sample_direction, wedge_measure, wedges
+from .edge_directions import sample_direction, sample_view, wedge_measure, wedges
 from .edge_points import (
     CURVE_LEAD,
     LEAD,
     SIDE_OFFSET,
     EdgePoint,
 )
-from .edges import EdgeTable, compact, edges_with_prior, sides
+from .edges import EdgeTable, compact, sides
+from .relevance import SecondaryEdges, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
 
@@ -83,11 +85,14 @@ class _Line:
     valid: mi.Bool
 
 
-def _line_on_segment(table: EdgeTable, row, t, u, active) -> _Line:
-    e = dr.gather(EdgeRows, table.segments.rows, row, active)
+def _line_on_segment(edges: SecondaryEdges, row, t, u, active) -> _Line:
+    e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
     dx = mi.Vector3f(e.p1 - e.p0)
     x = mi.Point3f(e.p0 + t * dx)
-    ω, pdf = sample_direction(e, u)
+    if edges.movers is None:
+        ω, pdf = sample_direction(e, wedges(e), u)
+    else:
+        ω, pdf = sample_view(e, wedges(e), edges.movers.seen_from(x), edges.rests(row, active), u)
     side = dr.cross(dx, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)
@@ -95,8 +100,9 @@ def _line_on_segment(table: EdgeTable, row, t, u, active) -> _Line:
     return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, lead, active & (across > 0) & (pdf > 0))
 
 
-def _line_on_curve(table: EdgeTable, row, t, u, active) -> _Line:
+def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
     """For a contour take the direction first: parallel lines of direction ω touch a surface along one contour."""
+    table = edges.table
     rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
     ω = mi.warp.square_to_uniform_sphere(u)
@@ -112,8 +118,9 @@ def _line_on_curve(table: EdgeTable, row, t, u, active) -> _Line:
     return _Line(x, local.x, scale, ω, side, across, pdf, CURVE_LEAD * scale, valid)
 
 
-def sample_views(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistribution) -> EdgeView:
+def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeView:
     """Lines through edge points that end on a receiver."""
+    table, dist = edges.table, edges.distribution
     count = job.spp * frame.crop_size[0] * frame.crop_size[1]
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_EDGE), lane)
@@ -123,9 +130,9 @@ def sample_views(job: Job, frame: SensorFrame, table: EdgeTable, dist: EdgeDistr
     straight = row < table.segment_count
     line = None
     if table.has_segments:
-        line = _line_on_segment(table, row, t, u, straight)
+        line = _line_on_segment(edges, row, t, u, straight)
     if table.has_curves:
-        on_curve = _line_on_curve(table, row, t, u, ~straight)
+        on_curve = _line_on_curve(edges, row, t, u, ~straight)
         line = on_curve if line is None else dr.select(straight, line, on_curve)
 
     # A tangent line starts beside a curved surface, not on it.
@@ -174,11 +181,11 @@ def longest_subpath(job: Job) -> int:
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = sensor_frame(job.sensor)
-    chosen = edges_with_prior(job, lambda rows: wedge_measure(wedges(rows)))
-    if chosen is None:
+    edges = secondary_edges(job, lambda rows: wedge_measure(wedges(rows)), lights_count=False)
+    if edges is None:
         return None
-    table, dist = chosen
-    view = sample_views(job, frame, table, dist)
+    table = edges.table
+    view = sample_views(job, frame, edges)
     if dr.width(view.row) == 0:
         return None
 

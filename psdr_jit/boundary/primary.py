@@ -25,9 +25,10 @@ from .. import film as films
 from ..ad import backpropagate, tangents
 from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
+from ..low_discrepancy import lane_sampler
 from ..path_steps import NoSink, skip_emitters, walk
 from ..sensor_frame import SensorFrame, sensor_frame
-from ..streams import Stream, lane_sampler, stream_seed
+from ..streams import Stream, stream_seed
 from . import film_weights
 from .edge_points import (
     VISIBILITY_EPSILON,

@@ -23,6 +23,7 @@ import mitsuba as mi
 
 from ..path_steps import PathLimits, continue_path
 from ..records import Hit
+from ..scattering import UNIFORM_SHARE, sample_scattering
 from ..sensor_frame import SensorFrame, look_at
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
@@ -173,9 +174,9 @@ def walk_to_sensor(
         seen &= ~scene.ray_test(shadow, seen)
         g_connect = deposit(a, si.n, view.ω)
 
-        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        bs = sample_scattering(ctx, si, bsdf, sampler.next_1d(), sampler.next_2d(), UNIFORM_SHARE, active)
         onward = si.to_world(bs.wo)
-        weight *= _adjoint_correction(si, onward)
+        weight = bs.weight * _adjoint_correction(si, onward)
         g_continue = deposit(a, si.n, -onward)
         records.write(
             k,
@@ -191,7 +192,7 @@ def walk_to_sensor(
             ),
             active,
         )
-        β, η, alive, _inv = continue_path(sampler, β * weight, η * bs.eta, k + 1, rr_depth)
+        β, η, alive, _inv = continue_path(sampler, β * weight, η * bs.η, k + 1, rr_depth)
         a -= g_continue
         k += 1
         active &= alive & (k < max_depth)

@@ -1,0 +1,71 @@
+"""How a path goes on at a surface: BSDF sampling, with a share of uniform directions where derivatives need it.
+
+A derivative divides by cosines that the value does not have: a surface that turns changes cosθ itself, and a vertex
+slides by 1/cosθ. Under a density that vanishes with cosθ, as that of a diffuse BSDF does, the variance of
+such a weight is infinite. A defensive mixture bounds it [Veach 1997, §9.2.4; Hesterberg 1995].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+#: Share of uniform directions where derivatives are estimated along a path.
+UNIFORM_SHARE = 0.25
+
+
+@dataclass
+class Scattering:
+    """A sampled direction. Detached, one entry per lane."""
+
+    wo: mi.Vector3f  # unit, local frame
+    pdf: mi.Float  # per solid angle; of a delta lobe, its probability
+    weight: mi.Spectrum  # f cosθ / pdf
+    η: mi.Float  # relative refractive index along the direction
+    delta: mi.Bool
+
+
+def mixture_pdf(si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, pdf_bsdf: mi.Float, share: float) -> mi.Float:
+    """Density of `sample_scattering` in direction `wo` (local) where the BSDF alone has `pdf_bsdf`."""
+    if share == 0:
+        return pdf_bsdf
+    through = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+    same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
+    uniform = dr.select(through, dr.inv_four_pi, dr.select(same_side, dr.inv_two_pi, 0))
+    share = _share(bsdf, share)
+    return share * uniform + (1 - share) * pdf_bsdf
+
+
+def _share(bsdf: mi.BSDFPtr, share: float) -> mi.Float:
+    """Delta lobes keep pure BSDF sampling: their probability is not a density."""
+    return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta), 0, share)
+
+
+def sample_scattering(
+    ctx, si, bsdf: mi.BSDFPtr, u_lobe: mi.Float, u: mi.Point2f, share: float, active: mi.Bool
+) -> Scattering:
+    """Direction in which a path goes on: uniform with probability `share`, else sampled from the BSDF."""
+    if share == 0:
+        bs, weight = bsdf.sample(ctx, si, u_lobe, u, active)
+        return Scattering(bs.wo, bs.pdf, weight, bs.eta, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+    q = _share(bsdf, share)
+    uniform = u_lobe < q
+    u_lobe = dr.select(uniform, u_lobe / q, (u_lobe - q) / (1 - q))
+    bs, weight = bsdf.sample(ctx, si, u_lobe, u, active & ~uniform)
+    delta = ~uniform & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+
+    hemisphere = mi.warp.square_to_uniform_hemisphere(u)
+    through = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+    below = dr.select(through, u_lobe < 0.5, mi.Frame3f.cos_theta(si.wi) < 0)
+    hemisphere.z = dr.select(below, -hemisphere.z, hemisphere.z)
+    wo = dr.select(uniform, hemisphere, bs.wo)
+
+    f, pdf_bsdf = bsdf.eval_pdf(ctx, si, wo, active & ~delta)
+    pdf = mixture_pdf(si, bsdf, wo, pdf_bsdf, share)
+    found = (uniform | (bs.pdf > 0)) & (pdf > 0)
+    weight = dr.select(delta, weight, dr.select(found, f / pdf, 0))
+    η = dr.select(uniform, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette
+    pdf = dr.select(delta, bs.pdf, dr.select(found, pdf, 0))
+    return Scattering(wo, pdf, weight, η, delta)
