@@ -54,8 +54,9 @@ class TermIntegrator(ADIntegrator):
         rejected = self.stats["rejected"]
         if self.options.depth_limit == 0:
             return []
+        shared: dict = {}
         return [
-            (term, Job(self, scene, sensor, facts, self.options, self.cache, rejected, seed, budget))
+            (term, Job(self, scene, sensor, facts, self.options, self.cache, shared, rejected, seed, budget))
             for term, budget in zip(TERMS, budgets, strict=True)
             # boundaries only count while they move: without motion, their terms are not asked for sensors they lack
             if budget > 0 and (facts.geometry_moves or term.name == "interior")

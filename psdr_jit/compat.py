@@ -29,6 +29,11 @@ def mesh_positions(mesh: mi.Mesh) -> mi.Point3f:
     return mi.Point3f(_parameter(mesh, VERTEX_POSITIONS), flip_axes=True)
 
 
+def positions_buffer(mesh: mi.Mesh) -> mi.Float:
+    """The array that holds the vertex positions, replaced whenever they change; attached if the mesh is."""
+    return _parameter(mesh, VERTEX_POSITIONS).array if INDEXED_MESHES else mesh.vertex_positions_buffer()
+
+
 def mesh_faces(mesh: mi.Mesh) -> mi.Vector3u:
     """Corner indices (F) into `mesh_positions`."""
     if not INDEXED_MESHES:

@@ -15,7 +15,9 @@ import numpy as np
 
 from .compat import mesh_faces, mesh_positions
 from .edge_geometry import EdgeTopologyDevice, edge_geometry, upload_topology
-from .mesh_edges import WELD_TOLERANCE, build_edge_topology, weld_vertices
+from .edge_rows import EdgeRows, concatenate
+from .junctions import Ball, JunctionRows, Solid, find_junctions
+from .mesh_edges import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
 from .mesh_shells import edge_shells
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
@@ -30,65 +32,62 @@ MAX_COMPARED_EDGES = 20000
 
 
 @dataclass
-class EdgeRows:
-    """One entry per edge; detached device arrays."""
-
-    v0: mi.UInt32  # global vertex indices of the end points
-    v1: mi.UInt32
-    p0: mi.Point3f  # their positions [m]
-    p1: mi.Point3f
-    n0: mi.Normal3f  # unit normals of the adjacent faces, consistently oriented across the edge
-    n1: mi.Normal3f
-    angle: mi.Float  # exterior angle [rad]
-    border: mi.Bool
-    seam: mi.Bool  # what the faces reflect may differ along the edge even where both are visible
-    traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
-    shell: mi.Float  # +1: closed surface, normals outward; −1: inward; 0: open, both sides can be seen
-    shape0: mi.UInt32  # index into the edge set's meshes, of the first face ...
-    shape1: mi.UInt32  # ... and of the second
-    prim0: mi.UInt32  # adjacent faces
-    prim1: mi.UInt32
-    corner0: mi.Vector2u  # corners of the faces at v0 and v1
-    corner1: mi.Vector2u
-
-
-@dataclass
 class _MeshTopology:
     """Cached per mesh: valid while the faces stay the same and welded vertices stay together."""
 
     faces: mi.UInt32  # kept alive, so that its index identifies it
+    host: EdgeTopology
     device: EdgeTopologyDevice
     shell: mi.Float  # per edge, see EdgeRows
 
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """Straight edges of `meshes`. `rows` is None when there are none."""
+    """Straight edges of `meshes`, and the curves along which they cut into each other. `rows`: None without any."""
 
     meshes: tuple[mi.Mesh, ...]
     rows: EdgeRows | None
     shapes: mi.ShapePtr | None  # by EdgeRows.shape0 and shape1
+    junctions: JunctionRows | None  # by EdgeRows.junction
+    normals: mi.Normal3f | None  # by vertex, 0 on flat-shaded meshes; None if all are
 
 
-def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict) -> EdgeSet:
+def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict, balls: tuple[Ball, ...] = ()) -> EdgeSet:
     """Edges of `meshes` in their present state; topologies are kept in `cache` from call to call.
 
-    Coinciding edges of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
+    Intersection curves of meshes with each other and with `balls` are appended as rows of their own. Coinciding edges
+    of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
-        return EdgeSet((), None, None)
-    parts, first_vertex = [], 0
+        return EdgeSet((), None, None, None, None)
+    parts, solids, first_vertex = [], [], 0
     for i, mesh in enumerate(meshes):
         positions = dr.detach(mesh_positions(mesh))
         faces = mesh_faces(mesh)
         topology = _cached_topology(mesh, positions, faces, cache)
-        parts.append(_rows(mesh, positions, faces, topology, i, first_vertex))
+        parts.append(_rows(mesh, positions, faces, topology, i, first_vertex, moving[i]))
+        solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
         first_vertex += dr.width(positions)
-    rows = join_coinciding(parts[0] if len(parts) == 1 else _concatenate(parts), moving)
+    rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
+    found = find_junctions(solids, balls, cache)
+    if found is not None:
+        rows = concatenate([rows, found.edges])
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
     dr.eval(rows)
-    return EdgeSet(tuple(meshes), rows, shapes)
+    return EdgeSet(tuple(meshes), rows, shapes, None if found is None else found.rows, _normals(meshes))
+
+
+def _normals(meshes: list[mi.Mesh]) -> mi.Normal3f | None:
+    """Shading normals of all vertices, detached."""
+    if not any(_is_smooth(mesh) for mesh in meshes):
+        return None
+    parts = []
+    for mesh in meshes:
+        n = mesh.vertex_count()
+        smooth = _is_smooth(mesh)
+        parts.append(dr.detach(mesh.vertex_normal(dr.arange(mi.UInt32, n))) if smooth else dr.zeros(mi.Normal3f, n))
+    return mi.Normal3f(*(dr.concat([p[axis] for p in parts]) for axis in range(3)))
 
 
 def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
@@ -97,15 +96,6 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
     if len(positions) == 1:
         return positions[0]
     return mi.Point3f(*(dr.concat([p[axis] for p in positions]) for axis in range(3)))
-
-
-def face_uv(corners: mi.Vector2u, t: mi.Float) -> mi.Point2f:
-    """Barycentric (b1, b2) of the point at parameter `t` between two corners of a face, as Mitsuba's `prim_uv`."""
-
-    def weight(corner: int) -> mi.Float:
-        return dr.select(corners.x == corner, 1 - t, 0) + dr.select(corners.y == corner, t, 0)
-
-    return mi.Point2f(weight(1), weight(2))
 
 
 def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dict) -> _MeshTopology:
@@ -120,7 +110,8 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dic
     from .scene_checks import warn_about_mesh  # not at the top: the checks stand above the edge sets
 
     warn_about_mesh(mesh.id(), topology)
-    cache[key] = _MeshTopology(buffer, upload_topology(topology), mi.Float(edge_shells(topology, p, f)))
+    shell = mi.Float(edge_shells(topology, p, f))
+    cache[key] = _MeshTopology(buffer, topology, upload_topology(topology), shell)
     return cache[key]
 
 
@@ -138,10 +129,13 @@ def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vec
     return bool((gap <= 8 * WELD_TOLERANCE * extent)[0])
 
 
-def _is_seam(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice, angle: mi.Float) -> mi.Bool:
-    """Edges across which reflected radiance may jump: flat-shaded creases, split normals, texture seams."""
-    flat = not mesh.has_vertex_normals() or mesh.has_face_normals()
-    seam = angle > COPLANAR_ANGLE if flat else dr.full(mi.Bool, False, dr.width(angle))
+def _is_smooth(mesh: mi.Mesh) -> bool:
+    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+
+
+def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
+    """Edges along which shading normals or the coordinates of a texture are split."""
+    found = dr.full(mi.Bool, False, dr.width(topo.v0))
     ends = ((topo.v0, topo.corner1.x), (topo.v1, topo.corner1.y))
 
     def jumps(vertex_data) -> mi.Bool:
@@ -151,32 +145,39 @@ def _is_seam(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice, angle: mi.Float
             jump |= dr.norm(other - dr.gather(type(vertex_data), vertex_data, vertex)) > SEAM_TOLERANCE
         return topo.split & jump
 
-    if not flat:
-        seam |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
+    if _is_smooth(mesh):
+        found |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
     bsdf = mesh.bsdf()
     textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
     textured |= mesh.emitter() is not None and mi.has_flag(mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying)
     if textured and mesh.has_vertex_texcoords():
-        seam |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
-    return seam
+        found |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
+    return found
 
 
-def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_vertex: int) -> EdgeRows:
+def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_vertex: int, moves: bool) -> EdgeRows:
     topo = topology.device
     g = edge_geometry(positions, faces, topo)
     n = dr.width(topo.v0)
+    jumps = _jumps(mesh, faces, topo)
     return EdgeRows(
         v0=topo.v0 + first_vertex,
         v1=topo.v1 + first_vertex,
+        apex0=_corner_vertex(faces, topo.f0, topo.apex0) + first_vertex,
+        apex1=_corner_vertex(faces, topo.f1, topo.apex1) + first_vertex,
         p0=g.p0,
         p1=g.p1,
         n0=g.n0,
         n1=g.n1,
         angle=g.angle,
         border=topo.border,
-        seam=_is_seam(mesh, faces, topo, g.angle),
+        seam=jumps | (g.angle > COPLANAR_ANGLE),
+        smooth=~jumps & _is_smooth(mesh),
         traced=dr.full(mi.Bool, False, n),
-        shell=topology.shell,
+        moves=dr.full(mi.Bool, moves, n),
+        junction=dr.zeros(mi.UInt32, n),
+        shell0=topology.shell,
+        shell1=topology.shell,
         shape0=dr.full(mi.UInt32, shape, n),
         shape1=dr.full(mi.UInt32, shape, n),
         prim0=topo.f0,
@@ -184,19 +185,6 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         corner0=topo.corner0,
         corner1=topo.corner1,
     )
-
-
-def _concatenate(parts: list[EdgeRows]) -> EdgeRows:
-    def join(values):
-        first = values[0]
-        if dr.depth_v(first) == 1:
-            if dr.is_mask_v(first):  # concatenation moves numbers, not bits
-                return dr.concat([dr.select(v, mi.UInt32(1), 0) for v in values]) != 0
-            return dr.concat(values)
-        return type(first)(*(dr.concat([v[axis] for v in values]) for axis in range(len(first))))
-
-    fields = EdgeRows.__dataclass_fields__
-    return EdgeRows(**{name: join([getattr(part, name) for part in parts]) for name in fields})
 
 
 def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:

@@ -23,6 +23,7 @@ class Job:
     facts: SceneFacts
     options: Options
     cache: dict  # the integrator's: edge sets that outlive a call
+    shared: dict  # of all terms of one render call
     rejected: Rejected  # the integrator's: counts dropped samples
     seed: int | mi.UInt32
     spp: int

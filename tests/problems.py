@@ -123,7 +123,24 @@ PROBLEMS = (
     Problem("directional_shadow", "sun.to_world", 0.002, rotate=Z),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
+    Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X),
+    Problem("tube_shadow", "blocker.to_world", 0.004, direction=X),
+    Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
+    Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X),
+    Problem("constant_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
+    Problem("faceted_ball", "blocker.vertex_positions", 0.004, rotate=(1, 1, 0), slow=True),
+    Problem("faceted_ball", "blocker.vertex_positions", 0.004, direction=X),
+    Problem("smooth_ball_shadow", "blocker.vertex_positions", 0.005, direction=X, slow=True),
+    Problem("glossy_floor", "blocker.vertex_positions", 0.005, direction=X),
+    Problem("baffled_light", "blocker.vertex_positions", 0.005, direction=X, slow=True),
     Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3}),
+    # shapes that cut into each other
+    Problem("sunk_box", "box.vertex_positions", 0.003, direction=Y),
+    Problem("sunk_box", "box.vertex_positions", 0.003, direction=X, slow=True),
+    Problem("sunk_ball", "ball.to_world", 0.005, direction=X),
+    Problem("sunk_ball", "floor.to_world", 0.005, direction=Y, slow=True),
+    Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3, "lift": -0.05},
+            tag="sunk", slow=True),
 )  # fmt: skip
 
 

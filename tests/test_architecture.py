@@ -23,18 +23,19 @@ RANK = {
     "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "params": 1, "llvm_fetch": 1, "scene_io": 1,
     "scene_probes": 2, "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
-    "perturbation": 2, "llvm": 2,
+    "intersections": 2, "perturbation": 2, "llvm": 2,
     "scene_analysis": 3, "interior": 3, "drjit_libraries": 3,
     "scene_checks": 4, "job": 4,
-    "edge_set": 5,
+    "edge_rows": 2, "junctions": 5, "junction_points": 6,
+    "edge_set": 6,
     # estimators
-    "boundary": 6, "interior_term": 6,
-    "terms": 7,
+    "boundary": 7, "interior_term": 7,
+    "terms": 8,
     # plugins and the tools on top of them
-    "plugins": 8, "integrators": 8,
-    "gradient": 9, "finite_differences": 9,
-    "check": 10, "demo": 10,
-    "cli": 11,
+    "plugins": 9, "integrators": 9,
+    "gradient": 10, "finite_differences": 10,
+    "check": 11, "demo": 11,
+    "cli": 12,
 }  # fmt: skip
 """Stage of each module or package; an import must lead to a lower one, or stay within a package."""
 

@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..edge_distribution import pmf, sample_edge, stratified
-from ..edge_set import EdgeRows
+from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
 from ..path_steps import PathLimits
@@ -166,8 +166,12 @@ def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
 
 
 def _shadow_weight(job: Job, rows: EdgeRows) -> mi.Float:
-    """Weight per length: the lune in which the edge is a silhouette, if a light can see it as one."""
-    return dr.select(can_cast_shadow(job, rows), wedge_measure(silhouette_wedges(rows)), 0)
+    """Weight per length: the lune in which the edge is a silhouette, if a light can see it as one.
+
+    Where two surfaces cut into each other both block the light: nothing passes such a curve.
+    """
+    casts = can_cast_shadow(job, rows) & (rows.junction == 0)
+    return dr.select(casts, wedge_measure(silhouette_wedges(rows)), 0)
 
 
 def _prepared(job: Job) -> BoundarySamples | None:

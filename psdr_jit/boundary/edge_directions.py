@@ -19,14 +19,20 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..edge_set import EdgeRows
-from .film_weights import FULL_CREASE
+from ..edge_rows import EdgeRows
 
 #: Share of the directions of a resting edge that lead to the movers.
 CONE_SHARE = 0.5
 
-#: Relative density of the crease wedge for seams that have no angle (textures, split normals).
-SEAM_DENSITY = 0.25
+#: Exterior angle from which a crease between two visible faces counts as much as a silhouette [rad].
+FULL_CREASE = dr.pi / 4
+
+#: Relevance of seams that have no angle to go by (textures, split normals).
+SEAM_RELEVANCE = 0.25
+SEAM_ANGLE = 1e-2
+
+#: Factor on creases of smooth-shaded meshes, which show near the terminator of a light only.
+SMOOTH_FACTOR = 0.25
 
 
 @dataclass
@@ -35,9 +41,17 @@ class Wedges:
 
     start: mi.Float  # azimuth at which the first silhouette range begins: min(0, α)
     α: mi.Float  # |α|
-    silhouette: mi.Float  # density in both silhouette ranges
+    first: mi.Float  # density in the first silhouette range
     front: mi.Float  # density where both fronts are seen
+    second: mi.Float  # density in the second silhouette range
     back: mi.Float  # density in the remaining range
+
+
+def crease_relevance(e: EdgeRows) -> mi.Float:
+    """How much an edge matters where both of its faces are seen, relative to a silhouette."""
+    crease = dr.clip(e.angle / FULL_CREASE, 0, 1) * dr.select(e.smooth, SMOOTH_FACTOR, 1)
+    crease = dr.select(~e.smooth & (e.angle < SEAM_ANGLE), dr.maximum(crease, SEAM_RELEVANCE), crease)
+    return dr.select(e.seam, crease, 0)
 
 
 def wedges(e: EdgeRows) -> Wedges:
@@ -46,43 +60,50 @@ def wedges(e: EdgeRows) -> Wedges:
     into0, into1 = dr.cross(e.n0, τ), dr.cross(τ, e.n1)
     turn = dr.atan2(dr.dot(into1, e.n0), dr.dot(into1, into0))
     α = dr.select(turn < 0, turn + dr.pi, turn - dr.pi)  # signed: azimuth of face 1 minus π
-    crease = dr.clip(e.angle / FULL_CREASE, 0, 1)
-    crease = dr.select(e.seam, dr.select(e.angle < 1e-2, dr.maximum(crease, SEAM_DENSITY), crease), 0)
-    closed = e.shell > 0  # a closed surface seen from outside
+    crease = crease_relevance(e)
+    closed = e.shell0 > 0  # a closed surface seen from outside
     silhouette = dr.select(closed & (α < 0), 0.0, 1.0)
     back = dr.select(closed, 0, crease)
+    # Where two surfaces cut into each other, a viewer is not inside of either that is closed; an arc's normals turn.
+    meets = (e.junction > 0) & ((e.shell0 > 0) | (e.shell1 > 0))
+    before0, before1 = dr.select(e.shell1 > 0, 0.0, 1.0), dr.select(e.shell0 > 0, 0.0, 1.0)  # in front of one only
+    anywhere = (e.border | e.traced) & ~meets
     return Wedges(
         start=dr.minimum(α, 0),
-        α=dr.select(e.border | e.traced, 0, dr.abs(α)),
-        silhouette=silhouette,
-        front=dr.select(e.border | e.traced, 1, crease),
-        back=dr.select(e.border | e.traced, 1, back),
+        α=dr.select(anywhere, 0, dr.abs(α)),
+        first=dr.select(meets, dr.select(α < 0, before1, before0), silhouette),
+        front=dr.select(anywhere | meets, 1, crease),
+        second=dr.select(meets, dr.select(α < 0, before0, before1), silhouette),
+        back=dr.select(meets, 0, dr.select(anywhere, 1, back)),
     )
 
 
 def wedge_measure(w: Wedges) -> mi.Float:
     """∫ density dφ: how much an edge matters per length."""
-    return 2 * w.silhouette * w.α + (w.front + w.back) * (dr.pi - w.α)
+    return (w.first + w.second) * w.α + (w.front + w.back) * (dr.pi - w.α)
 
 
 def _azimuth_density(w: Wedges, φ: mi.Float) -> mi.Float:
     """Unnormalised density at azimuth φ, counted from `w.start`, in [0, 2π)."""
     first_half = φ < dr.pi
     local = dr.select(first_half, φ, φ - dr.pi)
-    return dr.select(local < w.α, w.silhouette, dr.select(first_half, w.front, w.back))
+    return dr.select(
+        local < w.α, dr.select(first_half, w.first, w.second), dr.select(first_half, w.front, w.back)
+    )
 
 
 def silhouette_wedges(e: EdgeRows) -> Wedges:
     """Where edge rows `e` can be a silhouette; a border is one from everywhere."""
     w = wedges(e)
     anywhere = e.border | e.traced
-    return Wedges(w.start, w.α, w.silhouette, dr.select(anywhere, 1.0, 0.0), dr.select(anywhere, 1.0, 0.0))
+    around = dr.select(anywhere, 1.0, 0.0)
+    return Wedges(w.start, w.α, w.first, around, w.second, around)
 
 
 def sample_direction(e: EdgeRows, w: Wedges, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
     """Direction ω from the viewer's side through the edge, and its density per solid angle: `(ω, pdf_sa)`."""
     lengths = [w.α, dr.pi - w.α, w.α, dr.pi - w.α]
-    densities = [w.silhouette, w.front, w.silhouette, w.back]
+    densities = [w.first, w.front, w.second, w.back]
     total = wedge_measure(w)
     x = u.x * total
     φ, begin = mi.Float(0), mi.Float(0)

@@ -16,7 +16,9 @@ from ..analytic_edges import (
     transform_point,
     transform_vector,
 )
-from ..edge_set import EdgeSet, attached_positions, face_uv
+from ..edge_rows import EdgeRows, apex_uv, face_uv
+from ..edge_set import EdgeSet, attached_positions
+from ..junction_points import bend, junction_motion
 from ..sensor_frame import SensorFrame, View, look_at, towards_viewer, viewpoint
 
 #: Sideways distance at which a ray that passes a straight edge is traced, relative to the coordinates: far above
@@ -65,21 +67,36 @@ def _across(dx: mi.Vector3f, ω: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
     return dr.select(length > 0, side / length, 0), length
 
 
+def segment_position(edges: EdgeSet, row, t, active) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Point at parameter `t` of an edge or of an intersection curve, and its derivative by `t`."""
+    p0 = dr.gather(mi.Point3f, edges.rows.p0, row, active)
+    dx = mi.Vector3f(dr.gather(mi.Point3f, edges.rows.p1, row, active) - p0)
+    x = mi.Point3f(p0 + t * dx)
+    if edges.junctions is None:
+        return x, dx
+    return bend(edges.junctions, dr.gather(mi.UInt32, edges.rows.junction, row, active), x, dx, active)
+
+
 def segment_point(edges: EdgeSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active) -> EdgePoint:
     """Point at parameter `t` of a straight edge."""
-    p0 = dr.gather(mi.Point3f, edges.rows.p0, row, active)
-    dx = dr.gather(mi.Point3f, edges.rows.p1, row, active) - p0
-    x = p0 + t * dx
+    x, dx = segment_position(edges, row, t, active)
     view = look_at(frame, x, aperture)
-    side, speed = _across(mi.Vector3f(dx), view.ω)
+    side, speed = _across(dx, view.ω)
     return EdgePoint(x, view, side, speed, active & view.valid & (speed > 0))
 
 
-def segment_motion(edges: EdgeSet, row, t, active) -> mi.Point3f:
-    """The same point attached to the vertices of its mesh."""
+def segment_motion(edges: EdgeSet, row, t, active) -> mi.Vector3f:
+    """Vector of value 0 that moves with the same point: attached to the vertices of its mesh, or to both surfaces."""
     positions = attached_positions(edges.meshes)
     v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (edges.rows.v0, edges.rows.v1))
-    return (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(mi.Point3f, positions, v1, active)
+    x = (1 - t) * dr.gather(mi.Point3f, positions, v0, active) + t * dr.gather(mi.Point3f, positions, v1, active)
+    motion = mi.Vector3f(x - dr.detach(x))
+    if edges.junctions is None:
+        return motion
+    index = dr.gather(mi.UInt32, edges.rows.junction, row, active)
+    at_junction = active & (index > 0)
+    place, _ = segment_position(edges, row, t, at_junction)
+    return dr.select(at_junction, junction_motion(edges.junctions, index, t, dr.detach(place), at_junction), motion)
 
 
 def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, active) -> tuple[Side, mi.Bool]:
@@ -101,18 +118,38 @@ def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, ac
     on0, on1 = a0 * towards > 0, ~rows.border & (a1 * towards > 0)
     use1 = on1 & (~on0 | nearer1)
     own = (on0 | on1) & ~rows.traced
-    uv = dr.select(use1, face_uv(rows.corner1, t), face_uv(rows.corner0, t))
+    corners = dr.select(use1, rows.corner1, rows.corner0)
+    uv = face_uv(corners, t)
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.valid = own & active
     pi.t = dr.select(pi.valid, point.view.r, dr.inf)
     pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
-    pi.prim_uv = uv + INSET * (1 / 3 - uv)
     pi.shape = dr.gather(mi.ShapePtr, edges.shapes, dr.select(use1, rows.shape1, rows.shape0), active & own)
+    fringe = _fringe(edges, rows, use1, t, -ω, own & active)
+    uv += fringe * (apex_uv(corners) - uv)
+    pi.prim_uv = uv + INSET * (1 / 3 - uv)
 
     offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + dr.norm(rows.p1 - rows.p0))
     beside = point.x + towards * offset * point.side - LEAD * offset * ω
     ray = mi.Ray3f(dr.select(own, point.view.o, beside), ω)
     return Side(ray, pi, ~own), rows.border | silhouette | rows.seam | rows.traced
+
+
+def _fringe(edges: EdgeSet, rows: EdgeRows, use1: mi.Bool, t: mi.Float, viewer: mi.Vector3f, active) -> mi.Float:
+    """Share of the way from an edge to the opposite corner at which the shading normal begins to face the viewer.
+
+    Along an outline, interpolated normals turn away from the viewer before the surface does, and a BSDF is black
+    there. The step at the inner end of this fringe, as thin as the mesh is fine, is counted with the outline.
+    """
+    if edges.normals is None:
+        return mi.Float(0)
+    active &= rows.smooth
+    apex = dr.select(use1, rows.apex1, rows.apex0)
+    at0, at1, at_apex = (
+        dr.dot(dr.gather(mi.Normal3f, edges.normals, v, active), viewer) for v in (rows.v0, rows.v1, apex)
+    )
+    at_edge = (1 - t) * at0 + t * at1
+    return dr.select(active & (at_edge < 0) & (at_apex > 0), at_edge / (at_edge - at_apex), 0)
 
 
 def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active):

@@ -17,7 +17,7 @@ from ..analytic_edges import (
     transform_point,
     transform_vector,
 )
-from ..edge_set import EdgeRows
+from ..edge_rows import EdgeRows
 from .edge_directions import pdf_direction, pdf_view, sample_direction, sample_view, silhouette_wedges
 from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET
 from .relevance import SecondaryEdges

@@ -11,7 +11,7 @@ from ..analytic_edges import CurveSet, curve_set
 from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
-from ..scene_analysis import ShapeFacts
+from ..junctions import Ball
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
 
@@ -21,10 +21,19 @@ class EdgeTable:
 
     segments: EdgeSet
     curves: CurveSet
+    curve_moves: mi.UInt32  # by CurveRows.shape: 1 if the shape can move
 
     @property
     def segment_count(self) -> int:
         return 0 if self.segments.rows is None else dr.width(self.segments.rows.v0)
+
+    @property
+    def rests(self) -> list[mi.Bool]:
+        """Rows whose shapes cannot move: straight ones, curves; whatever there is of them."""
+        found = [~self.segments.rows.moves] if self.has_segments else []
+        if self.has_curves:
+            found.append(dr.gather(mi.UInt32, self.curve_moves, self.curves.rows.shape) == 0)
+        return found
 
     @property
     def has_segments(self) -> bool:
@@ -35,13 +44,21 @@ class EdgeTable:
         return self.curves.rows is not None
 
 
-def edge_table(job: Job, chosen: list[ShapeFacts]) -> EdgeTable:
-    """Edges of the `chosen` shapes; mesh topologies live in the job's cache."""
+def scene_edges(job: Job) -> EdgeTable:
+    """Edges of all shapes, built once per render call; mesh topologies live in the job's cache."""
+    if "edges" not in job.shared:
+        job.shared["edges"] = _edge_table(job)
+    return job.shared["edges"]
+
+
+def _edge_table(job: Job) -> EdgeTable:
     shapes = job.scene.shapes()
-    meshes = [s for s in chosen if s.is_mesh]
-    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache)
-    curves = curve_set([(shapes[s.index], s.plugin) for s in chosen if not s.is_mesh])
-    return EdgeTable(segments, curves)
+    chosen = [s for s in job.facts.shapes if s.index >= 0]
+    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
+    balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
+    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
+    curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
+    return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))
 
 
 def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
@@ -88,8 +105,7 @@ def edge_motion(table: EdgeTable, row: mi.UInt32, t: mi.Float, local: mi.Point3f
     straight = row < table.segment_count
     motion = mi.Vector3f(0)
     if table.has_segments:
-        x = segment_motion(table.segments, row, t, straight)
-        motion += dr.select(straight, x - dr.detach(x), 0)
+        motion += dr.select(straight, segment_motion(table.segments, row, t, straight), 0)
     if table.has_curves:
         x = curve_motion(table.curves, row - table.segment_count, local, ~straight)
         motion += dr.select(straight, 0, x - dr.detach(x))

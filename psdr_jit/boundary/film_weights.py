@@ -13,10 +13,8 @@ import mitsuba as mi
 from ..analytic_edges import CurveSet
 from ..edge_set import EdgeSet
 from ..sensor_frame import SensorFrame, look_at, viewpoint
+from .edge_directions import crease_relevance
 from .edge_points import curve_row_point, facing
-
-#: Exterior angle from which a crease between two visible faces counts as much as a silhouette [rad].
-FULL_CREASE = dr.pi / 4
 
 #: Edges this far outside the film [px] may still matter: a lens point other than the centre sees them elsewhere.
 LENS_CENTRE = 0.5
@@ -51,12 +49,14 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     s0, s1 = facing(rows.n0, rows.p0, view), facing(rows.n1, rows.p0, view)
     slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
     may_be_silhouette = rows.traced | rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
-    crease = dr.select(rows.seam, dr.clip(rows.angle / FULL_CREASE, 0, 1), 0)
-    # Seams of smooth or coplanar faces (textures, split normals) have no angle to go by.
-    crease = dr.select(rows.seam & (rows.angle < 1e-2), dr.maximum(crease, 0.25), crease)
-    relevance = dr.select(may_be_silhouette, 1, crease)
-    shell = rows.shell * dr.gather(mi.Float, _outside(edges, frame, slack), rows.shape0)
-    hidden = (shell != 0) & (s0 * shell < -slack) & (s1 * shell < -slack)
+    relevance = dr.select(may_be_silhouette, 1, crease_relevance(rows))
+    outside = _outside(edges, frame, slack)
+    shell0, shell1 = (rows.shell0 * dr.gather(mi.Float, outside, rows.shape0),
+                      rows.shell1 * dr.gather(mi.Float, outside, rows.shape1))  # fmt: skip
+    behind0 = (shell0 != 0) & (s0 * shell0 < -slack)
+    behind1 = (shell1 != 0) & (s1 * shell1 < -slack)
+    # Where two surfaces cut into each other, being behind one of them is enough.
+    hidden = dr.select(rows.junction > 0, behind0 | behind1, behind0 & behind1)
 
     in_front = (dr.minimum(z0, z1) > frame.near) & (dr.minimum(z0, z1) < frame.far)
     behind = dr.maximum(z0, z1) <= frame.near

@@ -30,7 +30,7 @@ from ..analytic_edges import (
     transform_vector,
 )
 from ..edge_distribution import pmf, sample_edge, stratified
-from ..edge_set import EdgeRows
+from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
 from ..path_records import RadianceByDepth
@@ -45,6 +45,7 @@ from .edge_points import (
     LEAD,
     SIDE_OFFSET,
     EdgePoint,
+    segment_position,
 )
 from .edges import EdgeTable, compact, sides
 from .relevance import SecondaryEdges, secondary_edges
@@ -87,8 +88,7 @@ class _Line:
 
 def _line_on_segment(edges: SecondaryEdges, row, t, u, active) -> _Line:
     e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
-    dx = mi.Vector3f(e.p1 - e.p0)
-    x = mi.Point3f(e.p0 + t * dx)
+    x, dx = segment_position(edges.table.segments, row, t, active)
     if edges.movers is None:
         ω, pdf = sample_direction(e, wedges(e), u)
     else:

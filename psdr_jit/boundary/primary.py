@@ -36,7 +36,7 @@ from .edge_points import (
     curve_row_point,
     segment_point,
 )
-from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_table, sides
+from .edges import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
 
 
 @dataclass(frozen=True)
@@ -60,14 +60,15 @@ class EdgeSample:
 
 def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
     """Edges that can move on the film: of moving shapes, or of all if the camera moves. None: nothing can."""
-    facts = job.facts
-    table = edge_table(job, [s for s in facts.shapes if s.index >= 0 and (facts.camera_moves or s.moves)])
+    table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
     weights = []
     if table.has_segments:
         weights.append(film_weights.segment_weights(table.segments, frame, border))
     if table.has_curves:
         weights.append(film_weights.curve_weights(table.curves, frame, border))
+    if not job.facts.camera_moves:
+        weights = [dr.select(rests, 0, w) for w, rests in zip(weights, table.rests, strict=True)]
     distribution = distribution_of(weights)
     return None if distribution is None else PrimaryEdges(table, distribution)
 

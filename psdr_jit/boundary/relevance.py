@@ -17,10 +17,10 @@ import mitsuba as mi
 
 from ..analytic_edges import attached_to_world, curve_lengths
 from ..edge_distribution import EdgeDistribution
-from ..edge_set import EdgeRows
+from ..edge_rows import EdgeRows
 from ..job import Job
 from .edge_directions import Cone, towards_sphere
-from .edges import EdgeTable, distribution_of, edge_table
+from .edges import EdgeTable, distribution_of, scene_edges
 
 #: Share of the samples on edges of resting shapes while only shapes move.
 STATIC_SHARE = 0.25
@@ -65,24 +65,20 @@ def secondary_edges(job: Job, per_length, lights_count: bool) -> SecondaryEdges 
     `per_length(rows)`: weight of straight edges per length; curves weigh π. `lights_count`: a light that moves makes
     every edge matter (its shadows move).
     """
-    facts = job.facts
-    chosen = [s for s in facts.shapes if s.index >= 0]
-    table = edge_table(job, chosen)
-    weights, resting, relevance = [], [], []
+    table = scene_edges(job)
+    weights, resting, places = [], table.rests, []
     movers = _movers(job, lights_count)
     if table.has_segments:
         rows = table.segments.rows
         weights.append(dr.norm(rows.p1 - rows.p0) * per_length(rows))
-        resting.append(_rests([s.moves for s in chosen if s.is_mesh], rows.shape0))
-        relevance.append((rows.p0 + rows.p1) / 2)
+        places.append((rows.p0 + rows.p1) / 2)
     if table.has_curves:
         rows = table.curves.rows
         weights.append(curve_lengths(table.curves) * dr.pi)
-        resting.append(_rests([s.moves for s in chosen if not s.is_mesh], rows.shape))
         to_world = attached_to_world(table.curves.shapes, rows.shape)
-        relevance.append(mi.Point3f(dr.detach(to_world[3])))
+        places.append(mi.Point3f(dr.detach(to_world[3])))
     if movers is not None:
-        weights = _balanced(weights, resting, [movers.seen_from(x).share for x in relevance])
+        weights = _balanced(weights, resting, [movers.seen_from(x).share for x in places])
     distribution = distribution_of(weights)
     if distribution is None:
         return None
@@ -91,10 +87,6 @@ def secondary_edges(job: Job, per_length, lights_count: bool) -> SecondaryEdges 
         joined = [dr.select(r, mi.UInt32(1), 0) for r in resting]
         flags = (joined[0] if len(joined) == 1 else dr.concat(joined)) != 0
     return SecondaryEdges(table, distribution, movers, flags)
-
-
-def _rests(moves: list[bool], shape: mi.UInt32) -> mi.Bool:
-    return dr.gather(mi.UInt32, mi.UInt32([int(m) for m in moves]), shape) == 0
 
 
 def _movers(job: Job, lights_count: bool) -> Movers | None:

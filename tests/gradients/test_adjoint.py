@@ -25,6 +25,11 @@ CASES = {  # what moves: (scene, parameter, terms whose derivative is not zero)
     "lamp": ("point_light", "lamp.position", {"interior"}),
     "radiance": ("textured_emitter", "card.emitter.radiance.data", {"interior"}),
     "texture": ("sliding_texture", "floor.bsdf.reflectance.data", {"interior"}),
+    "shadow": ("area_shadow", "blocker.vertex_positions", {"interior", "primary", "direct"}),
+    "sky": ("environment_shadow", "blocker.vertex_positions", {"interior", "primary", "direct", "indirect"}),
+    "sunk-mesh": ("sunk_box", "box.vertex_positions", {"interior", "primary", "direct", "indirect"}),
+    "sunk-ball": ("sunk_ball", "ball.to_world", {"interior", "primary", "direct", "indirect"}),
+    "floor-around-ball": ("sunk_ball", "floor.to_world", {"interior", "primary", "direct", "indirect"}),
     "roughness": ("rough_dielectric", "ball.bsdf.alpha.value", {"interior"}),
 }
 

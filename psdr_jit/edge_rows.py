@@ -1,0 +1,66 @@
+"""The columns of the edge table: what is known of every straight edge, whatever it belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class EdgeRows:
+    """One entry per edge; detached device arrays."""
+
+    v0: mi.UInt32  # global vertex indices of the end points
+    v1: mi.UInt32
+    apex0: mi.UInt32  # the vertices of both faces that are not on the edge
+    apex1: mi.UInt32
+    p0: mi.Point3f  # their positions [m]
+    p1: mi.Point3f
+    n0: mi.Normal3f  # unit normals of the adjacent faces, consistently oriented across the edge
+    n1: mi.Normal3f
+    angle: mi.Float  # exterior angle [rad]
+    border: mi.Bool
+    seam: mi.Bool  # what the faces reflect may differ along the edge even where both are visible ...
+    smooth: mi.Bool  # ... though they share shading normals: a face that turns away from a light is in its own shadow
+    traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
+    moves: mi.Bool  # one of the faces can move
+    junction: mi.UInt32  # 1 + row of the edge set's junctions; 0: an edge of a mesh
+    shell0: mi.Float  # of face 0. +1: closed surface, normals outward; −1: inward; 0: open, both sides can be seen
+    shell1: mi.Float
+    shape0: mi.UInt32  # index into the edge set's meshes, of the first face ...
+    shape1: mi.UInt32  # ... and of the second
+    prim0: mi.UInt32  # adjacent faces
+    prim1: mi.UInt32
+    corner0: mi.Vector2u  # corners of the faces at v0 and v1
+    corner1: mi.Vector2u
+
+
+def concatenate(parts: list[EdgeRows]) -> EdgeRows:
+    """All rows of several tables, in order."""
+    def join(values):
+        first = values[0]
+        if dr.depth_v(first) == 1:
+            if dr.is_mask_v(first):  # concatenation moves numbers, not bits
+                return dr.concat([dr.select(v, mi.UInt32(1), 0) for v in values]) != 0
+            return dr.concat(values)
+        return type(first)(*(dr.concat([v[axis] for v in values]) for axis in range(len(first))))
+
+    fields = EdgeRows.__dataclass_fields__
+    return EdgeRows(**{name: join([getattr(part, name) for part in parts]) for name in fields})
+
+
+def face_uv(corners: mi.Vector2u, t: mi.Float) -> mi.Point2f:
+    """Barycentric (b1, b2) of the point at parameter `t` between two corners of a face, as Mitsuba's `prim_uv`."""
+
+    def weight(corner: int) -> mi.Float:
+        return dr.select(corners.x == corner, 1 - t, 0) + dr.select(corners.y == corner, t, 0)
+
+    return mi.Point2f(weight(1), weight(2))
+
+
+def apex_uv(corners: mi.Vector2u) -> mi.Point2f:
+    """Barycentric (b1, b2) of the corner of a face that is neither of `corners`."""
+    apex = 3 - corners.x - corners.y
+    return mi.Point2f(dr.select(apex == 1, 1.0, 0.0), dr.select(apex == 2, 1.0, 0.0))

@@ -1,0 +1,60 @@
+"""Only relative motion counts: what moves together, the camera included, has no derivative at all."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import load, spec_of
+from problems import Problem
+
+from psdr_jit import integrators
+from psdr_jit.perturbation import perturb
+
+SEEDS, SPP, SIZE, BLOCK = 32, 32, 32, 4
+BOUND = 5.0  # standard errors
+
+CASES = {
+    "mesh-shadow": ("area_shadow", ("blocker.vertex_positions", "floor.to_world", "light.to_world", "camera.to_world")),
+    "ball-shadow": ("ball_shadow", ("blocker.to_world", "floor.to_world", "light.to_world", "camera.to_world")),
+    "lamp": ("point_shadow", ("blocker.vertex_positions", "floor.to_world", "lamp.position", "camera.to_world")),
+    "sunk": ("sunk_box", ("box.vertex_positions", "floor.to_world", "light.to_world", "camera.to_world")),
+    "sunk-ball": ("sunk_ball", ("ball.to_world", "floor.to_world", "light.to_world", "camera.to_world")),
+    "sky": ("constant_shadow", ("blocker.vertex_positions", "floor.to_world", "camera.to_world")),
+}
+
+
+def derivative(case: str, moving: slice, direction) -> np.ndarray:
+    """Images (seeds, H, W, C) for a common motion of some of the parameters of a case."""
+    scene_name, names = CASES[case]
+    scene = load(Problem(scene_name, names[0], 0.0), res=SIZE, max_depth=3)
+    motions = [perturb(scene, name, direction) for name in names[moving]]
+    integrator = integrators.build(spec_of(scene))
+    images = []
+    for seed in range(SEEDS):
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        for motion in motions:
+            motion.params[motion.name] = motion.curve(θ)
+            motion.params.set_dirty(motion.name)
+            motion.params.update()
+        dr.forward(θ, dr.ADFlag.ClearEdges)
+        images.append(np.array(integrator.render_forward(scene, None, seed=seed, spp=SPP), dtype=np.float64))
+    return np.stack(images)
+
+
+def blocks(images: np.ndarray) -> np.ndarray:
+    n, h, w, c = images.shape
+    return images.reshape(n, h // BLOCK, BLOCK, w // BLOCK, BLOCK, c).mean((2, 4))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_nothing_changes(llvm, case):
+    direction = (0.6, 0.3, -0.5)
+    together = blocks(derivative(case, slice(None), direction))
+    alone = blocks(derivative(case, slice(0, 1), direction))
+    error = together.std(0, ddof=1) / np.sqrt(SEEDS)
+    signal = np.abs(alone.mean(0)).max()
+    assert np.all(np.abs(together.mean(0)) <= BOUND * error + 1e-3 * signal)
+    assert np.sqrt(np.mean(error**2)) < 0.05 * signal  # the bound can fail: one of them alone is far from zero
