@@ -22,6 +22,7 @@ from .compat import mesh_faces, mesh_positions, positions_buffer
 from .edge_rows import EdgeRows
 from .errors import UnsupportedWarning
 from .mesh_edges import EdgeTopology
+from .shape_pairs import box_of, crossing
 
 #: Pieces into which the full circle of a ball in a plane is cut.
 ARC_PIECES = 64
@@ -97,37 +98,11 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], cache: dict) ->
     return table[1]
 
 
-def _pairs(solids: list[Solid], balls: tuple[Ball, ...]):
-    """Pairs that may intersect, by their bounding boxes."""
-    boxes = [_box(s.mesh) for s in solids]
-    for j, b in enumerate(solids):
-        for i in range(j):
-            if crosses(boxes[i], boxes[j]):
-                yield solids[i], b
-    for ball in balls:
-        box = _box(ball.shape)
-        for solid, own in zip(solids, boxes, strict=True):
-            if crosses(own, box):
-                yield solid, ball
-
-
-def _box(shape: mi.Shape) -> np.ndarray:
-    box = shape.bbox()
-    return np.array([box.min, box.max], dtype=float)
-
-
-def crosses(a: np.ndarray, b: np.ndarray) -> bool:
-    """May shapes within boxes a and b (2, 3) cut into each other? Touching is not cutting."""
-    tol = cut.tolerance(a, b)
-    for axis in range(3):
-        lower, upper = max(a[0, axis], b[0, axis]), min(a[1, axis], b[1, axis])
-        if upper - lower > tol:
-            continue
-        flat_a, flat_b = (box[1, axis] - box[0, axis] <= tol for box in (a, b))
-        inside = b if flat_a else a
-        if flat_a == flat_b or not inside[0, axis] + tol < lower <= upper < inside[1, axis] - tol:
-            return False
-    return True
+def _pairs(solids: list[Solid], balls: tuple[Ball, ...]) -> list[tuple[Solid, Solid | Ball]]:
+    """Pairs that may intersect, by their bounding boxes; at least one is a mesh."""
+    items = [*solids, *balls]
+    boxes = [box_of(item.mesh if isinstance(item, Solid) else item.shape) for item in items]
+    return [(items[i], items[j]) for i, j in crossing(boxes) if i < len(solids)]
 
 
 @dataclass(frozen=True)
@@ -140,7 +115,7 @@ class _State:
 
 def _state(item: Solid | Ball) -> _State:
     if isinstance(item, Ball):
-        return _State((item.moves, *_box(item.shape).ravel()), None)
+        return _State((item.moves, *box_of(item.shape).ravel()), None)
     buffer = dr.detach(positions_buffer(item.mesh))
     return _State((item.moves, item.index, buffer.index), buffer)
 

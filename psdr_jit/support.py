@@ -100,7 +100,8 @@ SUPPORT = (
     Row("films that convert samples themselves (specfilm)", "error", ""),
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
-    Row("shapes that cut into each other", "missing", "the curve where they meet is not sampled, and not detected yet"),
+    Row("meshes that cut into each other, a sphere in a mesh", "yes", "the curve where they meet; not within one mesh"),
+    Row("cylinders, disks and spheres that cut into other shapes", "warning", "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
 )  # fmt: skip
 

@@ -26,7 +26,7 @@ RANK = {
     "intersections": 2, "perturbation": 2, "llvm": 2,
     "scene_analysis": 3, "interior": 3, "drjit_libraries": 3,
     "scene_checks": 4, "job": 4,
-    "edge_rows": 2, "junctions": 5, "junction_points": 6,
+    "edge_rows": 2, "junctions": 5, "junction_points": 6, "shape_pairs": 3,
     "edge_set": 6,
     # estimators
     "boundary": 7, "interior_term": 7,

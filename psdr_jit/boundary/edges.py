@@ -12,6 +12,7 @@ from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..junctions import Ball
+from ..shape_pairs import warn_about_pairs
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
 
@@ -56,6 +57,7 @@ def _edge_table(job: Job) -> EdgeTable:
     chosen = [s for s in job.facts.shapes if s.index >= 0]
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
+    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], job.cache)
     segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))

@@ -462,7 +462,7 @@ def test_analysis_works_while_a_function_is_being_frozen():
 
 
 def test_support_table_names_every_status():
-    assert {row.status for row in SUPPORT} == {"yes", "warning", "error", "missing"}
+    assert {row.status for row in SUPPORT} == {"yes", "warning", "error"}
     assert support_table().count("\n") == len(SUPPORT) + 1
 
 

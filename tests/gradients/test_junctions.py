@@ -1,0 +1,89 @@
+"""Intersection curves alone: glowing shapes, so that nothing but the primary boundary has a derivative."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import assert_grad_close, fd, forward
+
+from psdr_jit.perturbation import perturb
+
+SEEDS, SPP, REFERENCE_SPP, EPS = 16, 64, 1024, 0.004
+
+
+def glow(value: float) -> dict:
+    return {"type": "area", "radiance": {"type": "rgb", "value": [value, value / 2, value / 4]}}
+
+
+def sunk(kind: str, side: float, tilt: float) -> mi.Scene:
+    """Something that glows, halfway in a floor that glows in another colour, seen from above."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    look = T().look_at(origin=[0.3, 4, 2.2], target=[0, 0, 0], up=[0, 1, 0])
+    turned = T().translate([0.05, -0.1, 0]).rotate([0.28, 0.96, 0], 25).scale(side)
+    return mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 1},
+        "camera": {"type": "perspective", "fov": 28, "to_world": look, "film": film},
+        "floor": {"type": "rectangle", "emitter": glow(0.5),
+                  "to_world": T().rotate([1, 0, 0], -90 + tilt).scale(2.5)},
+        "thing": {"type": kind, "emitter": glow(2.0), "to_world": turned},
+    })  # fmt: skip
+
+
+CASES = {
+    "cube-up": ("cube", "thing.vertex_positions", (0, 1, 0), None),
+    "cube-turns": ("cube", "thing.vertex_positions", None, (1, 0.2, 0)),
+    "cube-floor-turns": ("cube", "floor.to_world", None, (1, 0, 0.3)),
+    "ball-up": ("sphere", "thing.to_world", (0, 1, 0), None),
+    "ball-floor-turns": ("sphere", "floor.to_world", None, (1, 0, 0.3)),
+    "ball-floor-slides": ("sphere", "floor.to_world", (1, 0, 0), None),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_against_finite_differences(llvm, monkeypatch, case):
+    from psdr_jit import edge_set
+
+    kind, param, direction, rotate = CASES[case]
+    scene = sunk(kind, 0.6, 7.0)
+    motion = perturb(scene, param, direction, rotate=rotate)
+    spec = {"type": "psdr_path", "max_depth": 1}
+    estimate = forward(motion, spec, SEEDS, SPP)
+    if case == "ball-floor-slides":  # in its own plane: nothing but its far border moves, which is out of view
+        assert np.abs(estimate).max() < 1e-3
+        return
+    reference = fd(motion, spec, EPS, 2 * SEEDS, REFERENCE_SPP)
+    assert_grad_close(estimate, reference, 0.02)
+
+    monkeypatch.setattr(edge_set, "find_junctions", lambda solids, balls, cache: None)
+    with pytest.raises(AssertionError):  # without the curves the comparison fails
+        assert_grad_close(forward(motion, spec, SEEDS, SPP), reference, 0.02)
+
+
+def test_they_are_updated_with_the_shapes(llvm):
+    """A box that is lifted out of the floor and put back: the curve goes and comes, and rests are remembered."""
+    from psdr_jit.edge_set import edge_set
+
+    scene = sunk("cube", 0.6, 0.0)
+    params = mi.traverse(scene)
+    original = mi.Float(params["thing.vertex_positions"])
+    meshes, cache = list(scene.shapes()), {}
+
+    def count() -> int:
+        rows = edge_set(meshes, [s.id() == "thing" for s in meshes], cache).rows
+        assert np.array(rows.moves)[np.array(rows.junction) > 0].all()
+        return int((np.array(rows.junction) > 0).sum())
+
+    def lift(height: float) -> None:
+        points = dr.unravel(mi.Point3f, original) + mi.Vector3f(0, height, 0)
+        params["thing.vertex_positions"] = dr.ravel(points)
+        params.update()
+
+    there = count()
+    assert there >= 4
+    lift(5.0)
+    assert count() == 0
+    lift(0.0)
+    assert count() == there == count()
