@@ -36,6 +36,7 @@ QUIET = 0.5  # load average above which other processes disturb the measurement
 
 METHODS = {
     "path (primal)": {"type": "path"},
+    "psdr_path, every term": {"type": "psdr_path"},
     "psdr_path interior + primary": {"type": "psdr_path", "sppd": 0, "sppi": 0},
     "prb": {"type": "prb"},
     "prb_projective sppi=0, guiding none": {"type": "prb_projective", "sppi": 0, "guiding": "none"},

@@ -38,6 +38,7 @@ class PathSpaceIntegrator(TermIntegrator):
        - |int|
        - Memory for recorded paths in MiB; larger wavefronts run in several passes (Default: 1024)
 
+    Samples are paths: an edge sample of the primary and of the indirect term takes two, one on either side of the edge.
     A budget of 0 switches its term off; otherwise the runtime `spp` overrides it, and where neither is given the
     sampler's count is used, as in `prb_projective`.
     """

@@ -15,6 +15,7 @@ UNLIMITED = 0xFFFFFFFF
 class Options:
     """How far to trace and how many samples to spend.
 
+    Budgets count paths per pixel: an edge sample of the primary and indirect terms takes two, one for each side.
     `None` for a budget means "not set": the runtime `spp`, or else the sampler's count, decides.
     """
 

@@ -26,17 +26,16 @@ from ..edge_distribution import pmf, sample_edge, stratified
 from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
-from ..path_steps import PathLimits
 from ..records import Hit
 from ..sensor_frame import SensorFrame, sensor_frame
 from ..streams import Stream, stream_seed
 from . import secondary
 from .edge_directions import silhouette_wedges, wedge_measure
 from .edge_sources import source_from_curve, source_from_segment
-from .edges import compact
+from .edges import compact, edge_samples
 from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
 from .secondary import BoundarySamples
-from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
+from .sensor_subpath import UNLIMITED_VERTICES, subpaths
 
 
 @dataclass
@@ -63,7 +62,7 @@ def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> Boun
     """Boundary segments that end on a receiver and on a visible emitter; all others are left out (value 0)."""
     table, dist = edges.table, edges.distribution
     scene = job.scene
-    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
+    count = edge_samples(job, frame, paths=1)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_EDGE), lane)
     row, t = sample_edge(dist, stratified(count, rng.next_1d()))
@@ -120,29 +119,6 @@ def longest_subpath(job: Job) -> int:
     return job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES
 
 
-def record(job: Job, frame: SensorFrame, segment: BoundarySegment) -> SubpathRecords:
-    """Walk every segment's receiver back to the sensor."""
-    longest = longest_subpath(job)
-    records = SubpathRecords(dr.width(segment.row), longest)
-    rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_SUBPATH), segment.lane)
-    ray = mi.Ray3f(segment.receiver.o, segment.receiver.d, 0, segment.wavelengths)
-    a = -(1 - segment.ratio) * segment.n
-    walk_to_sensor(
-        job.scene,
-        rng,
-        frame,
-        ray,
-        segment.receiver.intersection(),
-        segment.value,
-        a,
-        PathLimits(longest, job.options.rr_depth),
-        records,
-        mi.Bool(True),
-    )
-    dr.eval(records.data)
-    return records
-
-
 def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
     """Attached −(r_B/r_S) n_⊥·x_S, or −r_B n_⊥·ω for a directional light: what the emitter contributes."""
     emitter = dr.reinterpret_array(mi.EmitterPtr, segment.emitter)
@@ -183,7 +159,17 @@ def _prepared(job: Job) -> BoundarySamples | None:
     segment = sample_segments(job, frame, edges)
     if dr.width(segment.row) == 0:
         return None
-    records = record(job, frame, segment)
+    records = subpaths(
+        job,
+        frame,
+        Stream.DIRECT_SUBPATH,
+        segment.lane,
+        segment.receiver,
+        segment.wavelengths,
+        segment.value,
+        -(1 - segment.ratio) * segment.n,
+        longest_subpath(job),
+    )
     return BoundarySamples(
         table=edges.table,
         row=segment.row,

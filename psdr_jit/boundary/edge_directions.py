@@ -87,9 +87,7 @@ def _azimuth_density(w: Wedges, φ: mi.Float) -> mi.Float:
     """Unnormalised density at azimuth φ, counted from `w.start`, in [0, 2π)."""
     first_half = φ < dr.pi
     local = dr.select(first_half, φ, φ - dr.pi)
-    return dr.select(
-        local < w.α, dr.select(first_half, w.first, w.second), dr.select(first_half, w.front, w.back)
-    )
+    return dr.select(local < w.α, dr.select(first_half, w.first, w.second), dr.select(first_half, w.front, w.back))
 
 
 def silhouette_wedges(e: EdgeRows) -> Wedges:

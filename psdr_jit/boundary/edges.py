@@ -12,6 +12,7 @@ from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..junctions import Ball
+from ..sensor_frame import SensorFrame
 from ..shape_pairs import warn_about_pairs
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
@@ -61,6 +62,11 @@ def _edge_table(job: Job) -> EdgeTable:
     segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))
+
+
+def edge_samples(job: Job, frame: SensorFrame, paths: int) -> int:
+    """Number of edge samples for a term's budget, which counts paths: one edge sample takes `paths` of them."""
+    return max(1, job.spp * frame.crop_size[0] * frame.crop_size[1] // paths)
 
 
 def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:

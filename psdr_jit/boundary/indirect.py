@@ -47,10 +47,10 @@ from .edge_points import (
     EdgePoint,
     segment_position,
 )
-from .edges import EdgeTable, compact, sides
+from .edges import EdgeTable, compact, edge_samples, sides
 from .relevance import SecondaryEdges, secondary_edges
 from .secondary import BoundarySamples
-from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, walk_to_sensor
+from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, subpaths
 
 
 @dataclass
@@ -121,7 +121,7 @@ def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
 def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeView:
     """Lines through edge points that end on a receiver."""
     table, dist = edges.table, edges.distribution
-    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
+    count = edge_samples(job, frame, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_EDGE), lane)
     row, t = sample_edge(dist, stratified(count, rng.next_1d()))
@@ -157,6 +157,26 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeVie
     return compact(view, line.valid & pi.is_valid())
 
 
+def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -> mi.Spectrum:
+    """L_− − L_+ for every recorded vertex, within the depth that its subpath leaves (flat, see `SubpathRecords`)."""
+    lane, left = records.lane_of(), records.depth - records.vertex_of()
+    # Whoever is not seen by the sensor need not be known.
+    useful = records.connected()
+    kept = dr.compress(useful)
+    n = dr.width(kept)
+    if n == 0:
+        return dr.zeros(mi.Spectrum, dr.width(lane))
+    slot = dr.zeros(mi.UInt32, records.lanes)
+    dr.scatter(slot, dr.arange(mi.UInt32, n), kept)
+    by_depth, final = _both_sides(job, table, dr.gather(EdgeView, view, kept), records.depth + 1)
+    needed = dr.gather(mi.Bool, useful, lane)
+    slot = 2 * dr.gather(mi.UInt32, slot, lane)
+    minus, plus = (
+        by_depth.up_to(left, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed)) for side in (0, 1)
+    )
+    return dr.select(needed, minus - plus, 0)
+
+
 def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     """Radiance from both sides of every edge point, by depth: `(by_depth, final)`, 2 lanes each (−, +)."""
     n = dr.width(view.row)
@@ -189,29 +209,18 @@ def _prepared(job: Job) -> BoundarySamples | None:
     if dr.width(view.row) == 0:
         return None
 
-    longest = longest_subpath(job)
-    records = SubpathRecords(dr.width(view.row), longest)
-    ray = mi.Ray3f(view.receiver.o, view.receiver.d, 0, view.wavelengths)
-    walk_to_sensor(
-        job.scene,
-        lane_sampler(stream_seed(job.seed, Stream.INDIRECT_SUBPATH), view.lane),
+    records = subpaths(
+        job,
         frame,
-        ray,
-        view.receiver.intersection(),
+        Stream.INDIRECT_SUBPATH,
+        view.lane,
+        view.receiver,
+        view.wavelengths,
         view.weight,
         -view.side,
-        PathLimits(longest, job.options.rr_depth),
-        records,
-        mi.Bool(True),
+        longest_subpath(job),
     )
-    dr.eval(records.data)
-
-    by_depth, final = _both_sides(job, table, view, longest + 1)
-    lane, left = records.lane_of(), longest - records.vertex_of()
-    minus, plus = (
-        by_depth.up_to(left, 2 * lane + side, dr.gather(mi.Spectrum, final, 2 * lane + side)) for side in (0, 1)
-    )
-    value = job.rejected.keep_finite(records.data.W * (minus - plus))
+    value = job.rejected.keep_finite(records.data.W * _step(job, table, view, records))
     dr.eval(value)
     return BoundarySamples(
         table=table,

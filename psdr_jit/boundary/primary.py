@@ -36,7 +36,7 @@ from .edge_points import (
     curve_row_point,
     segment_point,
 )
-from .edges import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
+from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_samples, scene_edges, sides
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _edge_point(edges: PrimaryEdges, sample: EdgeSample, frame: SensorFrame) -> 
 def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSample:
     """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
     lower, upper = frame.window
-    count = job.spp * frame.crop_size[0] * frame.crop_size[1]
+    count = edge_samples(job, frame, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
     row, t = sample_edge(edges.distribution, stratified(count, rng.next_1d()))

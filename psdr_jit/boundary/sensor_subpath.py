@@ -21,10 +21,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..job import Job
+from ..low_discrepancy import lane_sampler
 from ..path_steps import PathLimits, continue_path
 from ..records import Hit
 from ..scattering import UNIFORM_SHARE, sample_scattering
 from ..sensor_frame import SensorFrame, look_at
+from ..streams import Stream, stream_seed
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32
@@ -69,6 +72,10 @@ class SubpathRecords:
     def write(self, k: mi.UInt32, connection: Connection, active: mi.Bool) -> None:
         dr.scatter(self.data, connection, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
+    def connected(self) -> mi.Bool:
+        """Per lane: does any vertex see the sensor?"""
+        return _connected(self)
+
     def lane_of(self) -> mi.UInt32:
         """Subpath of every flat entry."""
         return dr.arange(mi.UInt32, self.lanes * self.depth) % self.stride
@@ -112,6 +119,45 @@ def _running_sum(records: SubpathRecords, values: mi.Float, out: _Flat, start: i
         done += 1
     dr.eval(total, out.array)
     return out.array
+
+
+@dr.syntax
+def _connected(records: SubpathRecords) -> mi.Bool:
+    k = mi.UInt32(0)
+    found = dr.full(mi.Bool, False, records.lanes)
+    while dr.hint(k < records.depth, label="psdr.connected"):
+        found |= dr.any(dr.gather(mi.Spectrum, records.data.W, k * records.stride + records.lane) != 0)
+        k += 1
+    return found
+
+
+def subpaths(
+    job: Job,
+    frame: SensorFrame,
+    stream: Stream,
+    lane: mi.UInt32,
+    receiver: Hit,
+    wavelengths: mi.Color0f,
+    value: mi.Spectrum,
+    a: mi.Vector3f,
+    longest: int,
+) -> SubpathRecords:
+    """Walk every receiver x_D back to the sensor, at most `longest` vertices; arguments as of `walk_to_sensor`."""
+    records = SubpathRecords(dr.width(lane), longest)
+    walk_to_sensor(
+        job.scene,
+        lane_sampler(stream_seed(job.seed, stream), lane),
+        frame,
+        mi.Ray3f(receiver.o, receiver.d, 0, wavelengths),
+        receiver.intersection(),
+        value,
+        a,
+        PathLimits(longest, job.options.rr_depth),
+        records,
+        mi.Bool(True),
+    )
+    dr.eval(records.data)
+    return records
 
 
 def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
