@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from typing import Any
@@ -21,10 +22,17 @@ EMPTY = "No rows are stored yet; `python -m benchmarks.backward_cost` makes some
 def benchmark_tables() -> str:
     """The newest row of every case and method, as Markdown."""
     found = rows.latest(rows.read(sorted(rows.RESULTS.glob("*.jsonl"))))
-    timings = [row for row in found if "wall_ms" in row]
-    variances = [row for row in found if "variance" in row]
-    blocks = [timing_table(timings)] if timings else []
-    blocks += [variance_table(variances)] if variances else []
+    by_bench = {name: [row for row in found if row["bench"] == name] for name in {row["bench"] for row in found}}
+    cost = by_bench.get("backward_cost", [])
+    parts = (
+        (efficiency_table, by_bench.get("efficiency", [])),
+        (timing_table, [row for row in cost if "wall_ms" in row]),
+        (variance_table, [row for row in cost if "variance" in row]),
+        (check_table, by_bench.get("checks", [])),
+        (convergence_table, by_bench.get("convergence", [])),
+        (call_table, by_bench.get("large_mesh", [])),
+    )
+    blocks = [table(some) for table, some in parts if some]
     return "\n\n".join([*blocks, *circumstances(found)]) if blocks else EMPTY
 
 
@@ -46,6 +54,62 @@ def variance_table(found: list[dict[str, Any]]) -> str:
         v = row["variance"]
         halves = " and ".join(f"{half:.3g}" for half in v["halves"])
         lines.append(f"| {describe(row)}, {len(row['seeds'])} seeds | {row['method']} | {v['mean']:.3g} | {halves} |")
+    return "\n".join(lines)
+
+
+def efficiency_table(found: list[dict[str, Any]]) -> str:
+    """Variance × seconds of every method, and how much better ours is than the best of the others."""
+    lines = [
+        "| case | method | pixel variance | seconds | variance x seconds | relative to ours | gain |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    ratios = []
+    for case in dict.fromkeys(row["case"] for row in found):
+        methods = [row for row in found if row["case"] == case]
+        ours = next(row for row in methods if row["method"] == "psdr_path")
+        peers = [row["cost"] / ours["cost"] for row in methods if row is not ours]
+        ratios += [min(peers)] if peers else []
+        for row in methods:
+            gain = f"{row['gain']:.3f} +- {row['gain_stderr']:.3f}"
+            lines.append(
+                f"| {describe(row)} | {row['method']} | {row['variance']:.2e} | {row['seconds']['median']:.3f} | "
+                f"{row['cost']:.2e} | {row['cost'] / ours['cost']:.3g} | {gain} |"
+            )
+    mean = math.exp(sum(math.log(r) for r in ratios) / len(ratios)) if ratios else float("nan")
+    return "\n".join(lines) + (
+        f"\n\nAgainst the best configuration of `prb_projective` in each case: {min(ratios):.3g} times to "
+        f"{max(ratios):.3g} times less variance x seconds, {mean:.3g} times in the geometric mean. The gain is "
+        "measured against finite differences: 1 is right."
+    )
+
+
+def check_table(found: list[dict[str, Any]]) -> str:
+    """`psdr gradient --check` on one scene per phenomenon."""
+    lines = ["| check against finite differences | gain | RMS z | max abs z | verdict |", "|---|---|---|---|---|"]
+    for row in found:
+        gain, z = f"{row['gain']:.4f} +- {row['gain_stderr']:.4f}", f"{row['rms_z']:.2f} | {row['max_z']:.1f}"
+        lines.append(f"| {row['case']} | {gain} | {z} | {row['verdict']} |")
+    return "\n".join(lines)
+
+
+def convergence_table(found: list[dict[str, Any]]) -> str:
+    """Error against samples."""
+    renders = found[0]["settings"]["renders"]
+    head = " | ".join(f"RMSE, {n} renders" for n in renders)
+    lines = [f"| case | {head} | error of the reference | slope |", "|---|" + "---|" * (len(renders) + 2)]
+    for row in found:
+        errors = " | ".join(f"{e:.2e}" for e in row["rmse"])
+        lines.append(f"| {row['case']} | {errors} | {row['reference_error']:.1e} | {row['slope']:.3f} |")
+    return "\n".join(lines)
+
+
+def call_table(found: list[dict[str, Any]]) -> str:
+    """Seconds of a call."""
+    lines = ["| case | method | seconds a call |", "|---|---|---|"]
+    for row in found:
+        t = row["seconds"]
+        median, q1, q3 = t["median"], t["q1"], t["q3"]
+        lines.append(f"| {describe(row)} | {row['method']} | {median:.3f} ({q1:.3f} to {q3:.3f}) |")
     return "\n".join(lines)
 
 

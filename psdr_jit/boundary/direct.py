@@ -27,12 +27,12 @@ from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
 from ..records import Hit
-from ..sensor_frame import SensorFrame, sensor_frame
+from ..sensor_frame import SensorFrame
 from ..streams import Stream, stream_seed
 from . import secondary
 from .edge_directions import silhouette_wedges, wedge_measure
 from .edge_sources import source_from_curve, source_from_segment
-from .edges import compact, edge_samples
+from .edges import compact, edge_samples, shared_frame
 from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, subpaths
@@ -152,7 +152,7 @@ def _shadow_weight(job: Job, rows: EdgeRows) -> mi.Float:
 
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
-    frame = sensor_frame(job.sensor)
+    frame = shared_frame(job)
     edges = secondary_edges(job, lambda rows: _shadow_weight(job, rows), lights_count=True)
     if edges is None:
         return None

@@ -23,7 +23,7 @@ from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET
 from .relevance import SecondaryEdges
 
 #: Share of the samples under a sky whose direction follows the edge instead of the emitter.
-EDGE_SHARE = 0.5
+EDGE_SHARE = 0.75
 
 
 @dataclass
@@ -57,24 +57,31 @@ def source_from_segment(
         ds, value = scene.sample_emitter_direction(it, u, False, active)
     else:
         ds, value = _from_edge_or_sky(scene, edges, e, row, it, u, active)
-    side = dr.cross(dx, ds.d)
-    across = dr.norm(side)
-    side = dr.select(across > 0, side / across, 0)
-    a0, a1 = dr.dot(dr.cross(e.n0, dx), side), dr.dot(dr.cross(dx, e.n1), side)
-    silhouette = (across > 0) & (a0 != 0) & (e.border | (a0 * a1 > 0))
+    n, across, silhouette = _open_side(e, dx, ds.d)
     offset = SIDE_OFFSET * (dr.max(dr.abs(it.p)) + length)
-    n = side * dr.select(a0 > 0, -1.0, 1.0)
     out = EdgeAndSource(
         it.p, mi.Point3f(0), across, n, ds.d, ds.dist, value, offset, LEAD * offset, active & silhouette
     )
     return out, ds
 
 
+def _open_side(e: EdgeRows, dx: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """Where light along `d` passes a straight edge: `(n_⊥, |dx × d|, whether the edge is a silhouette)`."""
+    side = dr.cross(dx, d)
+    across = dr.norm(side)
+    side = dr.select(across > 0, side / across, 0)
+    a0, a1 = dr.dot(dr.cross(e.n0, dx), side), dr.dot(dr.cross(dx, e.n1), side)
+    silhouette = (across > 0) & (a0 != 0) & (e.border | (a0 * a1 > 0))
+    return side * dr.select(a0 > 0, -1.0, 1.0), across, silhouette
+
+
 def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, active):
     """Emitter sampling and directions that suit the edge, in equal parts: `(ds, L_e / pdf)`.
 
     A sky is seen in every direction, so the edge's own density serves as well as the emitter's: balance heuristic of
-    both for samples of the sky [Veach 1997, §9.2.2]. Other emitters are left to emitter sampling.
+    both for samples of the sky [Veach 1997, §9.2.2]. Other emitters are left to emitter sampling. A line that leads
+    from the sky to a receiver does so in one of its two directions: the one that escapes is taken, whichever was
+    drawn, with the sum of both densities.
     """
     sky = scene.environment()
     by_edge = u.x < EDGE_SHARE
@@ -88,6 +95,11 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
     else:
         rests, cone = edges.rests(row, active), edges.movers.seen_from(it.p)
         ω, _ = sample_view(e, w, cone, rests, u)
+    dx = mi.Vector3f(e.p1 - e.p0)
+    n, _, silhouette = _open_side(e, dx, ω)
+    offset = SIDE_OFFSET * (dr.max(dr.abs(it.p)) + dr.norm(dx))
+    probe = mi.Ray3f(it.p + offset * n + LEAD * offset * ω, ω, 0, it.wavelengths)
+    ω = dr.select(scene.ray_test(probe, active & by_edge & silhouette), -ω, ω)
     free = dr.zeros(mi.DirectionSample3f, dr.width(ω))
     free.d, free.dist = ω, dr.opaque(mi.Float, 2 * scene.bbox().bounding_sphere().radius)
     free.p = it.p + free.dist * ω
@@ -96,7 +108,9 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
 
     from_sky = active & (ds.emitter == mi.EmitterPtr(sky))
     pdf_em = scene.pdf_emitter_direction(it, ds, from_sky)
-    pdf_edge = pdf_direction(e, w, ds.d) if cone is None else pdf_view(e, w, cone, rests, ds.d)
+    pdf_edge = mi.Float(0)
+    for d in (ds.d, -ds.d):
+        pdf_edge += pdf_direction(e, w, d) if cone is None else pdf_view(e, w, cone, rests, d)
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = -ds.d
     si.wavelengths = it.wavelengths

@@ -12,7 +12,7 @@ from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..junctions import Ball
-from ..sensor_frame import SensorFrame
+from ..sensor_frame import SensorFrame, sensor_frame
 from ..shape_pairs import warn_about_pairs
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
@@ -51,6 +51,13 @@ def scene_edges(job: Job) -> EdgeTable:
     if "edges" not in job.shared:
         job.shared["edges"] = _edge_table(job)
     return job.shared["edges"]
+
+
+def shared_frame(job: Job) -> SensorFrame:
+    """Geometry of the job's sensor, read once per render call."""
+    if "frame" not in job.shared:
+        job.shared["frame"] = sensor_frame(job.sensor)
+    return job.shared["frame"]
 
 
 def _edge_table(job: Job) -> EdgeTable:

@@ -36,10 +36,10 @@ from ..low_discrepancy import lane_sampler
 from ..path_records import RadianceByDepth
 from ..path_steps import PathLimits, walk
 from ..records import Hit
-from ..sensor_frame import SensorFrame, View, sensor_frame
+from ..sensor_frame import SensorFrame, View
 from ..streams import Stream, stream_seed
 from . import secondary
-from .edge_directions import sample_direction, sample_view, wedge_measure, wedges
+from .edge_directions import pdf_direction, pdf_view, sample_direction, sample_view, wedge_measure, wedges
 from .edge_points import (
     CURVE_LEAD,
     LEAD,
@@ -47,7 +47,7 @@ from .edge_points import (
     EdgePoint,
     segment_position,
 )
-from .edges import EdgeTable, compact, edge_samples, sides
+from .edges import EdgeTable, compact, edge_samples, shared_frame, sides
 from .relevance import SecondaryEdges, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, subpaths
@@ -82,6 +82,7 @@ class _Line:
     side: mi.Vector3f
     across: mi.Float  # |dx/dt × ω|
     pdf_sa: mi.Float
+    pdf_reversed: mi.Float  # per solid angle, of −ω
     lead: mi.Float
     valid: mi.Bool
 
@@ -89,15 +90,20 @@ class _Line:
 def _line_on_segment(edges: SecondaryEdges, row, t, u, active) -> _Line:
     e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
     x, dx = segment_position(edges.table.segments, row, t, active)
+    w = wedges(e)
     if edges.movers is None:
-        ω, pdf = sample_direction(e, wedges(e), u)
+        ω, pdf = sample_direction(e, w, u)
+        pdf_reversed = pdf_direction(e, w, -ω)
     else:
-        ω, pdf = sample_view(e, wedges(e), edges.movers.seen_from(x), edges.rests(row, active), u)
+        cone, rests = edges.movers.seen_from(x), edges.rests(row, active)
+        ω, pdf = sample_view(e, w, cone, rests, u)
+        pdf_reversed = pdf_view(e, w, cone, rests, -ω)
     side = dr.cross(dx, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)
     lead = LEAD * SIDE_OFFSET * (dr.max(dr.abs(x)) + dr.norm(dx))
-    return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, lead, active & (across > 0) & (pdf > 0))
+    valid = active & (across > 0) & (pdf > 0)
+    return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, pdf_reversed, lead, valid)
 
 
 def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
@@ -115,7 +121,7 @@ def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
     side = dr.select(across > 0, side / across, 0) * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)
     valid = active & local.valid & (across > 0)
     pdf = mi.Float(dr.inv_four_pi)
-    return _Line(x, local.x, scale, ω, side, across, pdf, CURVE_LEAD * scale, valid)
+    return _Line(x, local.x, scale, ω, side, across, pdf, pdf, CURVE_LEAD * scale, valid)
 
 
 def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeView:
@@ -136,10 +142,19 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeVie
         line = on_curve if line is None else dr.select(straight, line, on_curve)
 
     # A tangent line starts beside a curved surface, not on it.
-    beside = dr.select(straight, 0, SIDE_OFFSET * (dr.max(dr.abs(line.x)) + line.scale))
-    start = line.x + beside * line.side - line.lead * line.ω
-    down = mi.Ray3f(start, -line.ω, 0, wavelengths)
+    beside = dr.select(straight, 0, SIDE_OFFSET * (dr.max(dr.abs(line.x)) + line.scale)) * line.side
+    ω, side, pdf = line.ω, line.side, line.pdf_sa
+    down = mi.Ray3f(line.x + beside - line.lead * ω, -ω, 0, wavelengths)
     pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
+    if job.scene.environment() is not None:
+        # Lines of which one end escapes have their receiver at the other, whichever direction was drawn.
+        up = mi.Ray3f(line.x + beside + line.lead * ω, ω, 0, wavelengths)
+        other = job.scene.ray_intersect_preliminary(up, coherent=False, active=line.valid)
+        open_end = ~(pi.is_valid() & other.is_valid())
+        turn = ~pi.is_valid()
+        ω, side = dr.select(turn, -ω, ω), dr.select(turn & straight, -side, side)
+        down, pi = dr.select(turn, up, down), dr.select(turn, other, pi)
+        pdf = dr.select(open_end, pdf + line.pdf_reversed, pdf)
     view = EdgeView(
         row=row,
         t=t,
@@ -147,11 +162,11 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeVie
         local=line.local,
         scale=line.scale,
         x=line.x,
-        ω=line.ω,
-        side=line.side,
+        ω=ω,
+        side=side,
         receiver=Hit.of(down, pi),
         r=pi.t + line.lead,
-        weight=weight * (line.across / (pmf(dist, row) * line.pdf_sa * count)),
+        weight=weight * (line.across / (pmf(dist, row) * pdf * count)),
         wavelengths=wavelengths,
     )
     return compact(view, line.valid & pi.is_valid())
@@ -200,7 +215,7 @@ def longest_subpath(job: Job) -> int:
 
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
-    frame = sensor_frame(job.sensor)
+    frame = shared_frame(job)
     edges = secondary_edges(job, lambda rows: wedge_measure(wedges(rows)), lights_count=False)
     if edges is None:
         return None

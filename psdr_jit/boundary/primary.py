@@ -27,7 +27,7 @@ from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
 from ..job import Job
 from ..low_discrepancy import lane_sampler
 from ..path_steps import NoSink, skip_emitters, walk
-from ..sensor_frame import SensorFrame, sensor_frame
+from ..sensor_frame import SensorFrame
 from ..streams import Stream, stream_seed
 from . import film_weights
 from .edge_points import (
@@ -36,7 +36,7 @@ from .edge_points import (
     curve_row_point,
     segment_point,
 )
-from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_samples, scene_edges, sides
+from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_samples, scene_edges, shared_frame, sides
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
 
 def contribution(job: Job) -> mi.TensorXf | None:
     """The primary boundary as an image of value 0 that carries its derivative; None if no edge can move."""
-    frame = sensor_frame(job.sensor)
+    frame = shared_frame(job)
     with dr.suspend_grad():
         edges = primary_edges(job, frame)
         if edges is None:

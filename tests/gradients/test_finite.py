@@ -1,0 +1,53 @@
+"""No derivative image or gradient holds a value that is not finite, and no sample had to be dropped to get there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import load, motion_of, spec_of
+from problems import PROBLEMS, Problem
+
+from psdr_jit import integrators
+
+SIZE, SPP = 16, 4
+QUICK = ("area_shadow", "environment_shadow", "sunk_ball", "cbox", "glossy_floor", "rough_dielectric")
+
+
+def check(problem: Problem, seeds: int) -> None:
+    scene = load(problem, res=SIZE)
+    motion = motion_of(problem, scene)
+    integrator = integrators.build(spec_of(scene, **problem.options))
+    film = scene.sensors()[0].film()
+    channels = 4 if "rgba" in problem.load.values() else 3
+    grad_in = dr.ones(mi.TensorXf, (*reversed(film.crop_size()), channels))
+    for seed in range(seeds):
+        motion.attach()
+        image = np.array(integrator.render_forward(scene, motion.params, seed=seed, spp=SPP))
+        assert np.isfinite(image).all()
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        motion.params[motion.name] = motion.curve(θ)
+        motion.params.set_dirty(motion.name)
+        motion.params.update()
+        integrator.render_backward(scene, motion.params, grad_in, seed=seed, spp=SPP)
+        assert np.isfinite(float(dr.grad(θ)[0]))
+    motion.restore()
+    assert integrators.rejected(integrator) == 0
+
+
+def once(problems) -> list[Problem]:
+    """The first problem of each scene and parameter."""
+    return list({(p.scene, p.param, str(p.load)): p for p in reversed(problems)}.values())
+
+
+@pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in once(PROBLEMS) if p.scene in QUICK])
+def test_quick(llvm, problem):
+    check(problem, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in once(PROBLEMS)])
+def test_all_scenes(llvm, problem):
+    check(problem, 20)
