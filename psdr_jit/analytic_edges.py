@@ -116,6 +116,11 @@ def curve_lengths(curves: CurveSet) -> mi.Float:
     return dr.select(line, dr.norm(columns[2]), round_trip) / PIECES
 
 
+def curve_scale(columns: tuple[mi.Vector3f, ...], point: CurvePoint) -> mi.Float:
+    """Size of the shape across a curve [m]: the radius also at the rims of a long tube."""
+    return dr.minimum(dr.norm(transform_vector(columns, point.outward)), dr.norm(columns[0]))
+
+
 def curve_point(kind: mi.UInt32, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
     """Evaluate curve `kind` at parameter `s` for the local viewpoint `view`. Detached, branch-free."""
     sin, cos = dr.sincos(dr.two_pi * s)

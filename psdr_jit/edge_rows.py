@@ -27,7 +27,7 @@ class EdgeRows:
     traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
     moves: mi.Bool  # one of the faces can move
     junction: mi.UInt32  # 1 + row of the edge set's junctions; 0: an edge of a mesh
-    shell0: mi.Float  # of face 0. +1: closed surface, normals outward; −1: inward; 0: open, both sides can be seen
+    shell0: mi.Float  # of face 0. +1: closed surface, normals outward; −1: inward; 0: either side can be seen
     shell1: mi.Float
     shape0: mi.UInt32  # index into the edge set's meshes, of the first face ...
     shape1: mi.UInt32  # ... and of the second

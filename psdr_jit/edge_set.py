@@ -170,7 +170,7 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         n0=g.n0,
         n1=g.n1,
         angle=g.angle,
-        border=topo.border,
+        border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
         smooth=~jumps & _is_smooth(mesh),
         traced=dr.full(mi.Bool, False, n),
@@ -181,9 +181,9 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         shape0=dr.full(mi.UInt32, shape, n),
         shape1=dr.full(mi.UInt32, shape, n),
         prim0=topo.f0,
-        prim1=topo.f1,
+        prim1=mi.UInt32(topo.f1),
         corner0=topo.corner0,
-        corner1=topo.corner1,
+        corner1=mi.Vector2u(topo.corner1),
     )
 
 
@@ -240,4 +240,5 @@ def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
     dr.scatter(rows.prim1, of(rows.prim0, b), a)
     dr.scatter(rows.shape1, of(rows.shape0, b), a)
     dr.scatter(rows.border, mi.Bool(False), a)
+    dr.scatter(rows.smooth, mi.Bool(False), a)
     dr.scatter(rows.seam, mi.Bool(True), a)

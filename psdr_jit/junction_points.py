@@ -31,7 +31,7 @@ def junction_motion(rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Poi
     n_a, n_b = (dr.select(s.is_ball, dr.normalize(mi.Vector3f(x - s.centre)), mi.Vector3f(s.n)) for s in sheets)
     moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, active)) for n, s in zip((n_a, n_b), sheets, strict=True))
     c = dr.dot(n_a, n_b)
-    scale = dr.rcp(1 - dr.square(c))
+    scale = dr.rcp(dr.squared_norm(dr.cross(n_a, n_b)))  # 1 − c² without cancellation
     return (n_a - c * n_b) * scale * moved_a + (n_b - c * n_a) * scale * moved_b
 
 

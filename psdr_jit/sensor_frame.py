@@ -121,6 +121,19 @@ def lens_point(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Point3f:
     return mi.Point3f(frame.aperture * disk.x, frame.aperture * disk.y, 0)
 
 
+def origin_box(frame: SensorFrame) -> tuple[list[float], list[float]]:
+    """Bounding box `(lower, upper)` of the points in which camera rays start, world space."""
+    if frame.kind == "orthographic":
+        x0, y0 = float(frame.corner.x[0]), float(frame.corner.y[0])
+        x1, y1 = x0 + float(frame.extent.x[0]), y0 + float(frame.extent.y[0])
+        local = [(x, y, frame.near) for x in (x0, x1) for y in (y0, y1)]
+    else:
+        r = frame.aperture
+        local = [(x, y, 0.0) for x in (-r, r) for y in (-r, r)]
+    points = frame.to_world @ mi.Point3f(*(mi.Float(column) for column in zip(*local, strict=True)))
+    return [float(dr.min(c)[0]) for c in points], [float(dr.max(c)[0]) for c in points]
+
+
 def viewpoint(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Vector4f:
     """Homogeneous world position that sees: (x, y, z, 1), or (−direction, 0) for an orthographic sensor."""
     if frame.kind == "orthographic":

@@ -26,6 +26,7 @@ from ..edge_distribution import pmf, sample_edge, stratified
 from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
+from ..path_steps import SHADOW_EPSILON
 from ..records import Hit
 from ..sensor_frame import SensorFrame
 from ..streams import Stream, stream_seed
@@ -86,6 +87,7 @@ def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> Boun
     up.maxt = dr.select(on_surface, dr.inf, e.dist - e.lead)
     pi = scene.ray_intersect_preliminary(up, coherent=False, active=active)
     reached = pi.is_valid() & (pi.shape.emitter() == ds.emitter)
+    reached &= dr.abs(pi.t + e.lead - e.dist) < SHADOW_EPSILON * e.dist  # the sampled point, not another sheet of it
     active &= dr.select(on_surface, reached, ~pi.is_valid())
 
     # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.

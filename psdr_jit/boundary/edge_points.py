@@ -12,6 +12,7 @@ from ..analytic_edges import (
     CurveSet,
     attached_to_world,
     curve_point,
+    curve_scale,
     local_viewpoint,
     transform_point,
     transform_vector,
@@ -145,6 +146,7 @@ def _fringe(edges: EdgeSet, rows: EdgeRows, use1: mi.Bool, t: mi.Float, viewer: 
         return mi.Float(0)
     active &= rows.smooth
     apex = dr.select(use1, rows.apex1, rows.apex0)
+    viewer *= dr.sign(dr.dot(dr.select(use1, rows.n1, rows.n0), viewer))  # the back of an open surface
     at0, at1, at_apex = (
         dr.dot(dr.gather(mi.Normal3f, edges.normals, v, active), viewer) for v in (rows.v0, rows.v1, apex)
     )
@@ -161,7 +163,7 @@ def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.P
     view = look_at(frame, x, aperture)
     side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, view.ω)
     outward = transform_vector(columns, local.outward)
-    scale = dr.norm(outward)
+    scale = curve_scale(columns, local)
     side *= dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)  # + is away from the shape
     valid = active & view.valid & local.valid & (speed > 0)
     return EdgePoint(x, view, side, speed, valid), local.x, scale

@@ -13,6 +13,7 @@ from ..analytic_edges import (
     attached_to_world,
     curve_centre,
     curve_point,
+    curve_scale,
     local_viewpoint,
     transform_point,
     transform_vector,
@@ -124,32 +125,41 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
 def source_from_curve(
     scene, edges: SecondaryEdges, row, t, it, u, active
 ) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
-    """A contour depends on where it is seen from: the emitter is sampled from the shape's centre first.
+    """A contour depends on where it is seen from: the emitter is sampled without regard to where it shines.
 
-    The density then is per solid angle at the centre; carried over to the contour point by dω = cosθ dA / r².
+    Points of area lights are drawn by area and weighed by dω = cosθ dA / r² once the contour point is known.
     """
     table = edges.table
     rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
-    centre = transform_point(columns, curve_centre(rows.kind))
-    it.p = centre
-    ds, value = scene.sample_emitter_direction(it, u, False, active)
-    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-    eye = dr.select(infinite, ds.d, mi.Vector3f(ds.p))
+    index, inv_pmf, u.x = scene.sample_emitter(u.x, active)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
+    on_surface = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+    elsewhere = active & ~on_surface
+    ps, inv_pdf_area = emitter.sample_position(0, u, on_surface)
+    it.p = transform_point(columns, curve_centre(rows.kind))
+    ds, _ = emitter.sample_direction(it, u, elsewhere)
+    infinite = elsewhere & mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+    eye = dr.select(infinite, ds.d, mi.Vector3f(dr.select(on_surface, ps.p, ds.p)))
     view = mi.Vector4f(eye.x, eye.y, eye.z, dr.select(infinite, 0.0, 1.0))
     local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, view))
     x = transform_point(columns, local.x)
-    to_source = dr.select(infinite, ds.d, mi.Vector3f(ds.p - x))
-    dist = dr.select(infinite, ds.dist, dr.norm(to_source))
-    ω = dr.select(infinite, ds.d, to_source / dist)
+    dist = dr.select(infinite, ds.dist, dr.norm(eye - x))
+    ω = dr.select(infinite, ds.d, mi.Vector3f(eye - x) / dist)
 
     it.p = x
-    density = dr.dot(ds.n, ω) * dr.square(ds.dist) / (dr.dot(ds.n, ds.d) * dr.square(dist))
-    _, value_delta = ds.emitter.sample_direction(it, u, active & ds.delta)
-    value = dr.select(ds.delta, value_delta / ds.pdf, value * dr.select(infinite, 1, dr.maximum(density, 0)))
+    _, value = emitter.sample_direction(it, u, elsewhere)  # a lamp's falloff is that towards x
+    si = mi.SurfaceInteraction3f(ps, it.wavelengths)
+    si.wi = si.to_local(-ω)
+    cos_θ = dr.maximum(-dr.dot(ps.n, ω), 0)
+    by_area = emitter.eval(si, on_surface) * inv_pdf_area * cos_θ / dr.square(dist)
+    value = dr.select(on_surface, by_area, value) * inv_pmf
+    ds.p = dr.select(on_surface, ps.p, ds.p)
+    ds.pdf = dr.select(on_surface, ps.pdf, ds.pdf)
+    ds.emitter = emitter
 
     outward = transform_vector(columns, local.outward)
-    scale = dr.norm(outward)
+    scale = curve_scale(columns, local)
     side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)

@@ -12,7 +12,8 @@ from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..junctions import Ball
-from ..sensor_frame import SensorFrame, sensor_frame
+from ..scene_analysis import ShapeFacts
+from ..sensor_frame import SensorFrame, origin_box, sensor_frame
 from ..shape_pairs import warn_about_pairs
 from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
 
@@ -53,6 +54,21 @@ def scene_edges(job: Job) -> EdgeTable:
     return job.shared["edges"]
 
 
+def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
+    """1 for every mesh of which light paths from the sensor meet the outer side only, if it is closed; else 0.
+
+    Paths do not enter a closed opaque shape; they may start in it.
+    """
+    lower, upper = origin_box(shared_frame(job))
+    flags = []
+    for facts in meshes:
+        box = job.scene.shapes()[facts.index].bbox()
+        apart = any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
+        through = facts.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+        flags.append(float(apart and not through))
+    return mi.Float(flags)
+
+
 def shared_frame(job: Job) -> SensorFrame:
     """Geometry of the job's sensor, read once per render call."""
     if "frame" not in job.shared:
@@ -67,6 +83,10 @@ def _edge_table(job: Job) -> EdgeTable:
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], job.cache)
     segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
+    if segments.rows is not None:
+        outside = _seen_from_outside(job, meshes)
+        segments.rows.shell0 *= dr.gather(mi.Float, outside, segments.rows.shape0)
+        segments.rows.shell1 *= dr.gather(mi.Float, outside, segments.rows.shape1)
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))
 

@@ -50,9 +50,7 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
     may_be_silhouette = rows.traced | rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
     relevance = dr.select(may_be_silhouette, 1, crease_relevance(rows))
-    outside = _outside(edges, frame, slack)
-    shell0, shell1 = (rows.shell0 * dr.gather(mi.Float, outside, rows.shape0),
-                      rows.shell1 * dr.gather(mi.Float, outside, rows.shape1))  # fmt: skip
+    shell0, shell1 = rows.shell0, rows.shell1
     behind0 = (shell0 != 0) & (s0 * shell0 < -slack)
     behind1 = (shell1 != 0) & (s1 * shell1 < -slack)
     # Where two surfaces cut into each other, being behind one of them is enough.
@@ -65,17 +63,6 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     length = dr.clip(dr.norm(b.p - a.p), 1e-3, film)
     length = dr.select(in_front, dr.select(_overlaps(frame, a.p, b.p, reach, border), length, 0), film)
     return dr.select(hidden | behind, 0, relevance * length)
-
-
-def _outside(edges: EdgeSet, frame: SensorFrame, slack: float) -> mi.Float:
-    """1 for every mesh whose bounding box certainly leaves the viewpoint outside, else 0."""
-    eye = [float(c[0]) for c in frame.to_world @ mi.Point3f(0)]
-    flags = []
-    for mesh in edges.meshes:
-        box = mesh.bbox()
-        within = all(box.min[i] - slack <= eye[i] <= box.max[i] + slack for i in range(3))
-        flags.append(0.0 if within else 1.0)
-    return mi.Float(flags)
 
 
 def curve_weights(curves: CurveSet, frame: SensorFrame, border: int) -> mi.Float:

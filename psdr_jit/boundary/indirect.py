@@ -25,6 +25,7 @@ from ..analytic_edges import (
     CurveRows,
     attached_to_world,
     curve_point,
+    curve_scale,
     local_viewpoint,
     transform_point,
     transform_vector,
@@ -115,7 +116,7 @@ def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
     local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0)))
     x = mi.Point3f(transform_point(columns, local.x))
     outward = transform_vector(columns, local.outward)
-    scale = dr.norm(outward)
+    scale = curve_scale(columns, local)
     side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0) * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)

@@ -181,7 +181,7 @@ def walk_to_sensor(
     frame: SensorFrame,
     ray: mi.Ray3f,
     pi: mi.PreliminaryIntersection3f,
-    β: mi.Spectrum,
+    value: mi.Spectrum,
     a: mi.Vector3f,
     limits: PathLimits,
     records: SubpathRecords,
@@ -189,13 +189,14 @@ def walk_to_sensor(
 ) -> None:
     """Trace the sensor subpath of x_D = the hit `pi` of `ray`; fills `records`. Detached.
 
-    β: value of the boundary segment over its density; `a`: covector on u_D. `limits.max_depth`: vertices at most.
+    `value`: of the boundary segment over its density; `a`: covector on u_D. `limits.max_depth`: vertices at most.
     """
     max_depth, rr_depth = limits.max_depth, limits.rr_depth
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     ray = mi.Ray3f(ray)
     pi = mi.PreliminaryIntersection3f(pi)
-    β = mi.Spectrum(β)
+    value = mi.Spectrum(value)
+    throughput = mi.Spectrum(1)  # roulette judges the walk, not the segment that it started from
     a = mi.Vector3f(a)
     η = mi.Float(1)
     k = mi.UInt32(0)
@@ -214,7 +215,7 @@ def walk_to_sensor(
         seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
         f = bsdf.eval(ctx, si, wo, seen) * _adjoint_correction(si, to_sensor)
-        W = β * f / view.J_px
+        W = value * throughput * f / view.J_px
         seen &= dr.any(W != 0)
         shadow = si.spawn_ray_to(view.o)
         seen &= ~scene.ray_test(shadow, seen)
@@ -238,7 +239,7 @@ def walk_to_sensor(
             ),
             active,
         )
-        β, η, alive, _inv = continue_path(sampler, β * weight, η * bs.η, k + 1, rr_depth)
+        throughput, η, alive, _inv = continue_path(sampler, throughput * weight, η * bs.η, k + 1, rr_depth)
         a -= g_continue
         k += 1
         active &= alive & (k < max_depth)

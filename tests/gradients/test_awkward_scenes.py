@@ -1,0 +1,119 @@
+"""Scenes that once gave a wrong boundary term: one test each, against another way to build the same thing."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import assert_grad_close, fd, forward
+
+from psdr_jit.perturbation import perturb
+
+X = (1, 0, 0)
+SEEDS = 8
+ROOM = [  # (origin, axis, angle): the walls of a room of side 2
+    ((0, -1, 0), (1, 0, 0), -90), ((0, 1, 0), (1, 0, 0), 90), ((-1, 0, 0), (0, 1, 0), 90), ((1, 0, 0), (0, 1, 0), -90),
+    ((0, 0, -1), (0, 1, 0), 0), ((0, 0, 1), (0, 1, 0), 180),
+]  # fmt: skip
+
+
+def T():
+    return mi.ScalarTransform4f()
+
+
+def camera(origin, target, fov: float = 60):
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    return {"type": "perspective", "fov": fov, "film": film,
+            "to_world": T().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])}  # fmt: skip
+
+
+def scene(**objects) -> mi.Scene:
+    objects.setdefault("integrator", {"type": "path", "max_depth": 2})
+    return mi.load_dict({"type": "scene", **objects}, optimize=False)
+
+
+def white(two_sided: bool = False) -> dict:
+    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
+    return {"type": "twosided", "bsdf": bsdf} if two_sided else bsdf
+
+
+def term(name: str, depth: int, rr_depth: int = 1000) -> dict:
+    budgets = {"sppc": 0, "sppp": 0, "sppd": 0, "sppi": 0, name: 1}
+    return {"type": "psdr_path", "max_depth": depth, "rr_depth": rr_depth, **budgets}
+
+
+def mean_of(motion, spec: dict, spp: int) -> tuple[float, float]:
+    means = forward(motion, spec, SEEDS, spp).mean((1, 2, 3))
+    return means.mean(), means.std(ddof=1) / np.sqrt(SEEDS)
+
+
+def assert_same(a, b, power: float = 5.0):
+    """Two means with errors agree, and are known well enough to tell half of them apart."""
+    error = np.hypot(a[1], b[1])
+    assert abs(a[0] - b[0]) < 4 * error, (a, b)
+    assert abs(a[0]) > power * error, (a, b)
+
+
+@pytest.mark.parametrize("budget", ["sppd", "sppi"])
+def test_roulette_changes_nothing_on_average(llvm, budget):
+    walls = {f"wall{i}": {"type": "rectangle", "to_world": T().translate(o).rotate(axis, angle), "bsdf": white()}
+             for i, (o, axis, angle) in enumerate(ROOM)}  # fmt: skip
+    lamp = {"type": "rectangle", "to_world": T().translate([0, 0.95, 0]).rotate([1, 0, 0], 90).scale(0.3),
+            "emitter": {"type": "area"}}  # fmt: skip
+    box = {"type": "cube", "to_world": T().translate([0.2, -0.4, -0.2]).scale(0.25), "bsdf": white()}
+    built = scene(camera=camera((0.3, 0.2, 0.9), (0, -0.4, -0.3)), lamp=lamp, box=box, **walls)
+    motion = perturb(built, "box.vertex_positions", X)
+    spp = 64 if budget == "sppd" else 512
+    assert_same(mean_of(motion, term(budget, 6, 2), spp), mean_of(motion, term(budget, 6), spp), power=3.0)
+
+
+def test_the_camera_inside_of_a_closed_mesh(llvm):
+    """A room made of one two-sided cube, normals outward, and the same room made of six rectangles."""
+    found = []
+    lamp = {"type": "point", "position": [0.4, 0.5, -0.3], "intensity": 1.0}
+    view = camera((-0.4, 0.3, 0.5), (0.3, -0.6, -1), 80)
+    for walls in (
+        {"room": {"type": "cube", "bsdf": white(True)}},
+        {f"wall{i}": {"type": "rectangle", "to_world": T().translate(o).rotate(axis, angle), "bsdf": white()}
+         for i, (o, axis, angle) in enumerate(ROOM)},
+    ):  # fmt: skip
+        motion = perturb(scene(camera=view, lamp=lamp, **walls), "camera.to_world", (1, 0, 0))
+        found.append(mean_of(motion, term("sppi", 3), 256))
+    assert_same(*found)
+
+
+def test_a_light_with_several_sheets(llvm):
+    """Of two parallel sheets that shine the same way, the lower one hides the upper one."""
+    found = []
+    for heights in ((1.0,), (1.0, 1.01)):
+        corners = np.array([[-0.3, 0, -0.3], [0.3, 0, -0.3], [0.3, 0, 0.3], [-0.3, 0, 0.3]])
+        points = np.concatenate([corners + [0, h, 0] for h in heights]).astype(np.float32)
+        square = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32)
+        faces = np.concatenate([square + np.uint32(4 * i) for i in range(len(heights))])
+        props = mi.Properties()
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": 5.0})
+        mesh = mi.Mesh("lamp", len(points), len(faces), props=props)
+        params = mi.traverse(mesh)
+        params["vertex_positions"], params["faces"] = points.ravel(), faces.ravel()
+        params.update()
+        floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": white()}
+        card = {"type": "cube", "to_world": T().translate([0, 0.4, 0]).scale(0.15), "bsdf": white()}
+        built = scene(camera=camera((0, 1.2, 2), (0, 0, 0)), lamp=mesh, floor=floor, card=card)
+        found.append(mean_of(perturb(built, "card.vertex_positions", (1, 0, 0.3)), term("sppd", 2), 128))
+    assert_same(*found)
+
+
+def test_a_light_that_the_centre_of_a_ball_does_not_face(llvm):
+    """The plane of the lamp passes above the centre; the top of the ball's contour is lit nevertheless."""
+    turned = T().translate([2.5, 0, 0]).rotate([0, 1, 0], -90).scale(4)
+    wall = {"type": "rectangle", "to_world": turned, "bsdf": white()}
+    ball = {"type": "sphere", "to_world": T().scale(0.5), "bsdf": white()}
+    normal = np.array([0.8, 0.6, 0])  # lamp at (-0.35, 0.55): the centre is 0.05 behind its plane
+    aim = T().look_at(origin=[-0.35, 0.55, 0], target=list(np.array([-0.35, 0.55, 0]) + normal), up=[0, 0, 1])
+    lamp = {"type": "rectangle", "to_world": aim.scale(0.1), "emitter": {"type": "area", "radiance": 20.0}}
+    built = scene(camera=camera((0.5, 1.5, 3), (2.5, 0.6, 0), 45), wall=wall, ball=ball, lamp=lamp)
+    motion = perturb(built, "ball.to_world", (0, 1, 0))
+    spec = {"type": "psdr_path", "max_depth": 2, "rr_depth": 1000}
+    assert np.abs(forward(motion, term("sppd", 2), 1, 64)).max() > 0
+    estimate, reference = forward(motion, spec, 16, 128), fd(motion, spec, 0.002, 64, 512)
+    assert_grad_close(estimate, reference, 0.03)
