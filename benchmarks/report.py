@@ -119,16 +119,20 @@ def describe(row: dict[str, Any]) -> str:
 
 
 def circumstances(found: list[dict[str, Any]]) -> list[str]:
-    """One line for each run that the tables draw on."""
-    lines = {}
+    """One line for each benchmark, machine and commit that the tables draw on."""
+    groups: dict[str, list[dict[str, Any]]] = {}
     for row in found:
         machine, v = row["machine"], row["versions"]
-        lines[row["date"]] = (
-            f"Measured {row['date'][:10]} on {machine['cores']} cores of {machine['cpu']} (load {row['load']:.1f}); "
-            f"Mitsuba {v['mitsuba']}, Dr.Jit {v['drjit']}, LLVM {v['llvm']}, {v['variant']}, commit {row['commit']}. "
-            "Medians and quartiles."
+        text = (
+            f"{row['bench']}: {row['date'][:10]}, {machine['cores']} cores of {machine['cpu']}, Mitsuba {v['mitsuba']}, "
+            f"Dr.Jit {v['drjit']}, LLVM {v['llvm']}, {v['variant']}, commit {row['commit']}"
         )
-    return [lines[date] for date in sorted(lines)]
+        groups.setdefault(text, []).append(row)
+    lines = []
+    for text in sorted(groups):
+        loads = [row["load"] for row in groups[text]]
+        lines.append(f"- {text}, load {min(loads):.1f} to {max(loads):.1f}")
+    return ["Medians and quartiles.\n\n" + "\n".join(lines)]
 
 
 def with_block(text: str, name: str, content: str) -> str:
