@@ -124,8 +124,8 @@ def circumstances(found: list[dict[str, Any]]) -> list[str]:
     for row in found:
         machine, v = row["machine"], row["versions"]
         text = (
-            f"{row['bench']}: {row['date'][:10]}, {machine['cores']} cores of {machine['cpu']}, Mitsuba {v['mitsuba']}, "
-            f"Dr.Jit {v['drjit']}, LLVM {v['llvm']}, {v['variant']}, commit {row['commit']}"
+            f"{row['bench']}: {row['date'][:10]}, {machine['cores']} cores of {machine['cpu']}, "
+            f"Mitsuba {v['mitsuba']}, Dr.Jit {v['drjit']}, LLVM {v['llvm']}, {v['variant']}, commit {row['commit']}"
         )
         groups.setdefault(text, []).append(row)
     lines = []

@@ -38,6 +38,10 @@ from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import UNLIMITED_VERTICES, subpaths
 
+#: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
+#: are drawn as make about one path per sample.
+LINES_PER_PATH_UNDER_SKY = 2
+
 
 @dataclass
 class BoundarySegment:
@@ -64,6 +68,8 @@ def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> Boun
     table, dist = edges.table, edges.distribution
     scene = job.scene
     count = edge_samples(job, frame, paths=1)
+    if scene.environment() is not None:
+        count *= LINES_PER_PATH_UNDER_SKY
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_EDGE), lane)
     row, t = sample_edge(dist, stratified(count, rng.next_1d()))
