@@ -132,7 +132,8 @@ def source_from_curve(
     table = edges.table
     rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
     columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
-    index, inv_pmf, u.x = scene.sample_emitter(u.x, active)
+    index, inv_pmf, reused = scene.sample_emitter(u.x, active)
+    u = mi.Point2f(reused, u.y)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, active)
     on_surface = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
     elsewhere = active & ~on_surface

@@ -85,8 +85,9 @@ def _edge_table(job: Job) -> EdgeTable:
     segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
     if segments.rows is not None:
         outside = _seen_from_outside(job, meshes)
-        segments.rows.shell0 *= dr.gather(mi.Float, outside, segments.rows.shape0)
-        segments.rows.shell1 *= dr.gather(mi.Float, outside, segments.rows.shape1)
+        rows = segments.rows  # not in place: the arrays may be those of the cached topology
+        rows.shell0 = rows.shell0 * dr.gather(mi.Float, outside, rows.shape0)
+        rows.shell1 = rows.shell1 * dr.gather(mi.Float, outside, rows.shape1)
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))
 

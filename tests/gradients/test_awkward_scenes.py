@@ -117,3 +117,23 @@ def test_a_light_that_the_centre_of_a_ball_does_not_face(llvm):
     assert np.abs(forward(motion, term("sppd", 2), 1, 64)).max() > 0
     estimate, reference = forward(motion, spec, 16, 128), fd(motion, spec, 0.002, 64, 512)
     assert_grad_close(estimate, reference, 0.03)
+
+
+def test_a_camera_that_leaves_a_room(llvm):
+    """Seen from inside first, the same integrator must still know the box as closed from outside, and the reverse."""
+    from psdr_jit import integrators
+
+    box = {"room": {"type": "cube", "to_world": T().scale(0.5), "bsdf": white(True)}}
+    lamp = {"type": "point", "position": [0.1, 0.2, -0.1], "intensity": 1.0}
+    inside, outside = (camera(o, (0, 0, 0), 70) for o in ((0.1, 0.1, 0.3), (1, 1, 3)))
+    sun = {"type": "constant"}
+    built = scene(inside=inside, outside=outside, lamp=lamp, sun=sun, **box)
+    motion = perturb(built, "room.vertex_positions", (1, 0, 0))
+    integrator = integrators.build({"type": "psdr_path", "max_depth": 3})
+
+    def image(number: int) -> np.ndarray:
+        motion.attach()
+        return np.array(integrator.render_forward(built, motion.params, sensor=built.sensors()[number], seed=1, spp=4))
+
+    first, _, again = image(0), image(1), image(0)
+    assert np.array_equal(first, again) and first.any()
