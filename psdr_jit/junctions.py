@@ -121,7 +121,7 @@ def _state(item: Solid | Ball) -> _State:
 
 
 def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
-    """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, moves)`."""
+    """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
     mesh_a = _triangles(a)
     if isinstance(b, Ball):
         to_world = np.array(dr.detach(mi.traverse(b.shape)["to_world"].matrix), dtype=float).reshape(4, 4)
@@ -134,7 +134,8 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
         return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
     try:
-        found = cut.mesh_mesh(mesh_a, _triangles(b))
+        mesh_b = _triangles(b)
+        found = cut.mesh_mesh(mesh_a, mesh_b)
     except cut.TooManyPairs:
         warnings.warn(
             f"shapes '{a.mesh.id()}' and '{b.mesh.id()}' overlap with too many triangles to look for the curve along "
@@ -144,7 +145,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         )
         return None
     sheet_a = _sheet(a, mesh_a, found.face_a, found.start, found.end)
-    sheet_b = _sheet(b, _triangles(b), found.face_b, found.start, found.end)
+    sheet_b = _sheet(b, mesh_b, found.face_b, found.start, found.end)
     steep = np.linalg.norm(np.cross(sheet_a["n"], sheet_b["n"]), axis=1) > cut.PARALLEL
     if not steep.any():
         return None

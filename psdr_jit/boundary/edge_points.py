@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..analytic_edges import (
     PIECES,
+    CurvePoint,
     CurveSet,
     attached_to_world,
     curve_point,
@@ -154,6 +155,13 @@ def _fringe(edges: EdgeSet, rows: EdgeRows, use1: mi.Bool, t: mi.Float, viewer: 
     return dr.select(active & (at_edge < 0) & (at_apex > 0), at_edge / (at_edge - at_apex), 0)
 
 
+def contour_side(columns, local: CurvePoint, ω: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """Across a curve seen along ω: `(unit vector away from the shape, |dx/dt × ω|, size of the shape)`; t per piece."""
+    side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, ω)
+    outward = transform_vector(columns, local.outward)
+    return side * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0), speed, curve_scale(columns, local)
+
+
 def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.Point2f, active):
     """Point at parameter `t` of a piece of an analytic curve: `(EdgePoint, local point, outward, scale)`."""
     rows = dr.gather(type(curves.rows), curves.rows, row, active)
@@ -161,10 +169,7 @@ def curve_row_point(curves: CurveSet, row, t, frame: SensorFrame, aperture: mi.P
     local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, viewpoint(frame, aperture)))
     x = transform_point(columns, local.x)
     view = look_at(frame, x, aperture)
-    side, speed = _across(transform_vector(columns, local.dx_ds) / PIECES, view.ω)
-    outward = transform_vector(columns, local.outward)
-    scale = curve_scale(columns, local)
-    side *= dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)  # + is away from the shape
+    side, speed, scale = contour_side(columns, local, view.ω)
     valid = active & view.valid & local.valid & (speed > 0)
     return EdgePoint(x, view, side, speed, valid), local.x, scale
 

@@ -13,14 +13,12 @@ from ..analytic_edges import (
     attached_to_world,
     curve_centre,
     curve_point,
-    curve_scale,
     local_viewpoint,
     transform_point,
-    transform_vector,
 )
 from ..edge_rows import EdgeRows
-from .edge_directions import pdf_direction, pdf_view, sample_direction, sample_view, silhouette_wedges
-from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET
+from .edge_directions import silhouette_wedges
+from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET, contour_side
 from .relevance import SecondaryEdges
 
 #: Share of the samples under a sky whose direction follows the edge instead of the emitter.
@@ -48,7 +46,7 @@ def source_from_segment(
 ) -> tuple[EdgeAndSource, mi.DirectionSample3f]:
     """The emitter is sampled from the edge point; the edge must be a silhouette for that direction.
 
-    Under a sky, half of the samples take a direction in which the edge is a silhouette (`_from_edge_or_sky`).
+    Under a sky, `EDGE_SHARE` of the samples take a direction in which the edge is a silhouette (`_from_edge_or_sky`).
     """
     e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
     dx = mi.Vector3f(e.p1 - e.p0)
@@ -77,7 +75,7 @@ def _open_side(e: EdgeRows, dx: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Vector3
 
 
 def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, active):
-    """Emitter sampling and directions that suit the edge, in equal parts: `(ds, L_e / pdf)`.
+    """Emitter sampling and directions that suit the edge: `(ds, L_e / pdf)`.
 
     A sky is seen in every direction, so the edge's own density serves as well as the emitter's: balance heuristic of
     both for samples of the sky [Veach 1997, §9.2.2]. Other emitters are left to emitter sampling. A line that leads
@@ -90,12 +88,7 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
     ds, value = scene.sample_emitter_direction(it, u, False, active & ~by_edge)
 
     w = silhouette_wedges(e)
-    rests, cone = mi.Bool(False), None
-    if edges.movers is None:
-        ω, _ = sample_direction(e, w, u)
-    else:
-        rests, cone = edges.rests(row, active), edges.movers.seen_from(it.p)
-        ω, _ = sample_view(e, w, cone, rests, u)
+    ω = edges.sample_view(e, w, row, it.p, u, active)
     dx = mi.Vector3f(e.p1 - e.p0)
     n, _, silhouette = _open_side(e, dx, ω)
     offset = SIDE_OFFSET * (dr.max(dr.abs(it.p)) + dr.norm(dx))
@@ -109,9 +102,7 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
 
     from_sky = active & (ds.emitter == mi.EmitterPtr(sky))
     pdf_em = scene.pdf_emitter_direction(it, ds, from_sky)
-    pdf_edge = mi.Float(0)
-    for d in (ds.d, -ds.d):
-        pdf_edge += pdf_direction(e, w, d) if cone is None else pdf_view(e, w, cone, rests, d)
+    pdf_edge = sum(edges.pdf_view(e, w, row, it.p, d, active) for d in (ds.d, -ds.d))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = -ds.d
     si.wavelengths = it.wavelengths
@@ -159,12 +150,7 @@ def source_from_curve(
     ds.pdf = dr.select(on_surface, ps.pdf, ds.pdf)
     ds.emitter = emitter
 
-    outward = transform_vector(columns, local.outward)
-    scale = curve_scale(columns, local)
-    side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
-    across = dr.norm(side)
-    side = dr.select(across > 0, side / across, 0)
-    n = side * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)
+    n, across, scale = contour_side(columns, local, ω)
     offset = SIDE_OFFSET * (dr.max(dr.abs(x)) + scale)
     valid = active & local.valid & (across > 0)
     return EdgeAndSource(x, local.x, across, n, ω, dist, value, offset, CURVE_LEAD * scale, valid), ds

@@ -50,9 +50,7 @@ def segment_weights(edges: EdgeSet, frame: SensorFrame, border: int) -> mi.Float
     slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
     may_be_silhouette = rows.traced | rows.border | (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
     relevance = dr.select(may_be_silhouette, 1, crease_relevance(rows))
-    shell0, shell1 = rows.shell0, rows.shell1
-    behind0 = (shell0 != 0) & (s0 * shell0 < -slack)
-    behind1 = (shell1 != 0) & (s1 * shell1 < -slack)
+    behind0, behind1 = ((shell != 0) & (s * shell < -slack) for s, shell in ((s0, rows.shell0), (s1, rows.shell1)))
     # Where two surfaces cut into each other, being behind one of them is enough.
     hidden = dr.select(rows.junction > 0, behind0 | behind1, behind0 & behind1)
 

@@ -25,10 +25,8 @@ from ..analytic_edges import (
     CurveRows,
     attached_to_world,
     curve_point,
-    curve_scale,
     local_viewpoint,
     transform_point,
-    transform_vector,
 )
 from ..edge_distribution import pmf, sample_edge, stratified
 from ..edge_rows import EdgeRows
@@ -40,12 +38,13 @@ from ..records import Hit
 from ..sensor_frame import SensorFrame, View
 from ..streams import Stream, stream_seed
 from . import secondary
-from .edge_directions import pdf_direction, pdf_view, sample_direction, sample_view, wedge_measure, wedges
+from .edge_directions import wedge_measure, wedges
 from .edge_points import (
     CURVE_LEAD,
     LEAD,
     SIDE_OFFSET,
     EdgePoint,
+    contour_side,
     segment_position,
 )
 from .edges import EdgeTable, compact, edge_samples, shared_frame, sides
@@ -92,13 +91,8 @@ def _line_on_segment(edges: SecondaryEdges, row, t, u, active) -> _Line:
     e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
     x, dx = segment_position(edges.table.segments, row, t, active)
     w = wedges(e)
-    if edges.movers is None:
-        ω, pdf = sample_direction(e, w, u)
-        pdf_reversed = pdf_direction(e, w, -ω)
-    else:
-        cone, rests = edges.movers.seen_from(x), edges.rests(row, active)
-        ω, pdf = sample_view(e, w, cone, rests, u)
-        pdf_reversed = pdf_view(e, w, cone, rests, -ω)
+    ω = edges.sample_view(e, w, row, x, u, active)
+    pdf, pdf_reversed = (edges.pdf_view(e, w, row, x, d, active) for d in (ω, -ω))
     side = dr.cross(dx, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)
@@ -115,11 +109,7 @@ def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
     ω = mi.warp.square_to_uniform_sphere(u)
     local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0)))
     x = mi.Point3f(transform_point(columns, local.x))
-    outward = transform_vector(columns, local.outward)
-    scale = curve_scale(columns, local)
-    side = dr.cross(transform_vector(columns, local.dx_ds) / PIECES, ω)
-    across = dr.norm(side)
-    side = dr.select(across > 0, side / across, 0) * dr.select(dr.dot(outward, side) >= 0, 1.0, -1.0)
+    side, across, scale = contour_side(columns, local, ω)
     valid = active & local.valid & (across > 0)
     pdf = mi.Float(dr.inv_four_pi)
     return _Line(x, local.x, scale, ω, side, across, pdf, pdf, CURVE_LEAD * scale, valid)

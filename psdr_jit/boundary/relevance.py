@@ -19,7 +19,15 @@ from ..analytic_edges import attached_to_world, curve_lengths
 from ..edge_distribution import EdgeDistribution
 from ..edge_rows import EdgeRows
 from ..job import Job
-from .edge_directions import Cone, towards_sphere
+from .edge_directions import (
+    Cone,
+    Wedges,
+    pdf_direction,
+    pdf_view,
+    sample_direction,
+    sample_view,
+    towards_sphere,
+)
 from .edges import EdgeTable, distribution_of, scene_edges
 
 #: Share of the samples on edges of resting shapes while only shapes move.
@@ -53,10 +61,22 @@ class SecondaryEdges:
     table: EdgeTable
     distribution: EdgeDistribution
     movers: Movers | None
-    resting: mi.Bool  # by row of the table: matters only through what slides; empty without movers
+    resting: mi.Bool  # by row of the table: matters only through what slides; unused without movers
 
-    def rests(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        return dr.gather(mi.Bool, self.resting, row, active) if self.movers is not None else mi.Bool(False)
+    def sample_view(self, e: EdgeRows, w: Wedges, row, x: mi.Point3f, u: mi.Point2f, active) -> mi.Vector3f:
+        """Direction ω through the point `x` of edges `e` = `row`, from the viewer's side."""
+        if self.movers is None:
+            return sample_direction(e, w, u)[0]
+        return sample_view(e, w, self.movers.seen_from(x), self._rests(row, active), u)[0]
+
+    def pdf_view(self, e: EdgeRows, w: Wedges, row, x: mi.Point3f, ω: mi.Vector3f, active) -> mi.Float:
+        """Density per solid angle of `sample_view`."""
+        if self.movers is None:
+            return pdf_direction(e, w, ω)
+        return pdf_view(e, w, self.movers.seen_from(x), self._rests(row, active), ω)
+
+    def _rests(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        return dr.gather(mi.Bool, self.resting, row, active)
 
 
 def secondary_edges(job: Job, per_length, lights_count: bool) -> SecondaryEdges | None:
