@@ -13,7 +13,6 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks import rows
+from benchmarks.measure import measured
 from psdr_jit import scene_io
 from psdr_jit.gradient import DerivativeSampler
 from psdr_jit.perturbation import perturb
@@ -55,19 +55,7 @@ def load(placement: str, res: int) -> Any:
     return scene
 
 
-def measured(work: Callable[[], None]) -> tuple[float, float, int]:
-    """Wall time [ms], time inside of kernels [ms] and number of kernel launches of `work`."""
-    dr.sync_thread()
-    dr.kernel_history_clear()
-    start = time.perf_counter()
-    work()
-    dr.sync_thread()
-    wall = (time.perf_counter() - start) * 1e3
-    history = dr.kernel_history()
-    return wall, sum(entry["execution_time"] for entry in history), len(history)
-
-
-def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], None]]]:
+def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], Any]]]:
     """For each method: seed -> the work to be timed, all else prepared."""
     params = mi.traverse(scene)
     original = mi.Float(params[PARAMETER])
@@ -83,20 +71,20 @@ def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], None]]]
         params.update()
         dr.eval()
 
-    def primal(integrator: Any) -> Callable[[int], Callable[[], None]]:
-        def prepare(seed: int) -> Callable[[], None]:
+    def primal(integrator: Any) -> Callable[[int], Callable[[], Any]]:
+        def prepare(seed: int) -> Callable[[], Any]:
             attach(False)
-            return lambda: dr.eval(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+            return lambda: mi.render(scene, integrator=integrator, spp=spp, seed=seed)
 
         return prepare
 
-    def backward(integrator: Any) -> Callable[[int], Callable[[], None]]:
-        def prepare(seed: int) -> Callable[[], None]:
+    def backward(integrator: Any) -> Callable[[int], Callable[[], Any]]:
+        def prepare(seed: int) -> Callable[[], Any]:
             attach(True)
 
-            def work() -> None:
+            def work() -> Any:
                 integrator.render_backward(scene, params, grad_in, seed=seed, spp=spp)
-                dr.eval(dr.grad(params[PARAMETER]))
+                return dr.grad(params[PARAMETER])
 
             return work
 

@@ -1,39 +1,130 @@
-"""Writes the generated blocks of README.md: what is supported, and the stored benchmark rows. Computes nothing else.
+"""Charts and tables from stored rows, and the generated blocks of README.md. Measures nothing.
 
-    python -m benchmarks.report             rewrite the blocks
-    python -m benchmarks.report --check     exit status 1 if a block is out of date
+    psdr bench --report                     rewrite all
+    python -m benchmarks.report --check     exit status 1 if a table is out of date
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import sys
+from pathlib import Path
 from typing import Any
 
-from benchmarks import rows
+from benchmarks import rows, tables
 from psdr_jit.support import support_table
 
 README = rows.ROOT / "README.md"
-EMPTY = "No rows are stored yet; `python -m benchmarks.backward_cost` makes some."
+EMPTY = "No rows are stored yet; `psdr bench` makes some."
+CHARTS = {
+    "accuracy.png": "Relative error of the derivative image against seconds of rendering, per case and method",
+    "images.png": "Derivative images after an equal time, and their signed errors",
+    "ratios.png": "Ratios of the best prb_projective configuration to psdr_path, per case",
+    "stability.png": "Gain along sweeps towards where methods fail",
+    "cost.png": "Milliseconds and memory of a call against samples, resolution, depth, edges and parameters",
+}
+SWEEPS = (
+    "Sweeps towards where methods fail. Gain is the slope against finite differences, 1 is right; bold: off by more "
+    "than 0.05 and two standard errors."
+)
+WHAT_IS_WHAT = (
+    "Made by `psdr bench --report`. Errors are relative to the root mean square of the reference derivative image. The "
+    "gain is the least-squares slope against the reference (finite differences in the sweeps). Bias: root mean square "
+    "of what no number of renders would cure, or the bound below which it is not seen. Heavy-tail index: share of the "
+    "squared error in the top 0.1 % of pixel values, 0.004 for normal noise."
+)
 
 
-def benchmark_tables() -> str:
-    """The newest row of every case and method, as Markdown."""
-    found = rows.latest(rows.read(sorted(rows.RESULTS.glob("*.jsonl"))))
-    by_bench = {name: [row for row in found if row["bench"] == name] for name in {row["bench"] for row in found}}
-    cost = by_bench.get("backward_cost", [])
-    parts = (
-        (efficiency_table, by_bench.get("efficiency", [])),
-        (timing_table, [row for row in cost if "wall_ms" in row]),
-        (variance_table, [row for row in cost if "variance" in row]),
-        (check_table, by_bench.get("checks", [])),
-        (convergence_table, by_bench.get("convergence", [])),
-        (call_table, by_bench.get("large_mesh", [])),
-    )
-    blocks = [table(some) for table, some in parts if some]
+def benchmark_tables(found: list[dict[str, Any]]) -> str:
+    """What the README shows: charts, the summary of accuracy against speed, sweeps, checks."""
+    of = grouped(found)
+    measured = of.get("accuracy", [])
+    lines = tables.summary(measured)
+    parts = [
+        (lines, lambda: tables.summary_words(lines)),
+        (lines, lambda: tables.summary_table(lines)),
+        (lines, lambda: pictures("accuracy.png", "images.png", "ratios.png")),
+        (of.get("stability"), lambda: SWEEPS + "\n\n" + tables.stability_table(of["stability"])),
+        (of.get("stability"), lambda: pictures("stability.png")),
+        (of.get("cost"), lambda: pictures("cost.png")),
+        (of.get("backward_cost"), lambda: timing_table([row for row in of["backward_cost"] if "wall_ms" in row])),
+        (of.get("checks"), lambda: check_table(of["checks"])),
+        (of.get("convergence"), lambda: convergence_table(of["convergence"])),
+    ]
+    blocks = [make() for rows_there, make in parts if rows_there]
     return "\n\n".join([*blocks, *circumstances(found)]) if blocks else EMPTY
+
+
+def details(found: list[dict[str, Any]]) -> str:
+    """Every row as a table: the README of the results folder."""
+    of = grouped(found)
+    measured = of.get("accuracy", [])
+    parts = [
+        ("References", of.get("references"), lambda: tables.reference_table(of["references"], measured)),
+        ("Accuracy against speed", measured, lambda: tables.accuracy_table(measured)),
+        ("Stability", of.get("stability"), lambda: tables.stability_details(of["stability"])),
+        ("Cost", of.get("cost"), lambda: tables.cost_table(of["cost"])),
+        ("Interior variance", of.get("backward_cost"),
+         lambda: variance_table([row for row in of["backward_cost"] if "variance" in row])),
+    ]
+    blocks = [f"## {title}\n\n{make()}" for title, there, make in parts if there]
+    return "\n\n".join(["# Every stored row", WHAT_IS_WHAT, *blocks, *circumstances(found)]) + "\n"
+
+
+def grouped(found: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Rows by benchmark."""
+    names = dict.fromkeys(row["bench"] for row in found)
+    return {name: [row for row in found if row["bench"] == name] for name in names}
+
+
+def pictures(*names: str) -> str:
+    """Links to the charts that exist."""
+    there = [name for name in names if (rows.RESULTS / "charts" / name).is_file()]
+    return "\n\n".join(f"![{CHARTS[name]}](benchmarks/results/charts/{name})" for name in there)
+
+
+def stored_rows(folder: Path) -> list[dict[str, Any]]:
+    return rows.latest(rows.read(sorted(folder.glob("*.jsonl"))))
+
+
+def draw(folder: Path) -> list[Path]:
+    """Every chart that there are rows for."""
+    from benchmarks import charts
+
+    of = grouped(stored_rows(folder))
+    into, made = folder / "charts", []
+    if of.get("accuracy"):
+        made.append(charts.error_against_time(of["accuracy"], into / "accuracy.png"))
+        made.append(charts.derivative_images(folder, into / "images.png"))
+        if lines := tables.summary(of["accuracy"]):
+            made.append(charts.ratios(lines, into / "ratios.png"))
+    if of.get("stability"):
+        made.append(charts.stability(of["stability"], into / "stability.png"))
+    if of.get("cost"):
+        made.append(charts.costs(of["cost"], into / "cost.png"))
+    return [path for path in made if path is not None]
+
+
+def write(folder: Path) -> int:
+    """Charts and tables of a folder of rows; of the repository's own, the README's blocks as well."""
+    if not stored_rows(folder):
+        print(f"psdr bench: error: there are no rows in {folder}; run psdr bench first", file=sys.stderr)
+        return 2
+    for path in draw(folder):
+        print(f"wrote {path}")
+    (folder / "README.md").write_text(details(stored_rows(folder)), encoding="utf-8")
+    print(f"wrote {folder / 'README.md'}")
+    if folder == rows.RESULTS:
+        README.write_text(current(), encoding="utf-8")
+        print(f"wrote {README}")
+    return 0
+
+
+def current() -> str:
+    """The README with its blocks as the code and the rows have it."""
+    text = with_block(README.read_text(encoding="utf-8"), "support", support_table())
+    return with_block(text, "bench", benchmark_tables(stored_rows(rows.RESULTS)))
 
 
 def timing_table(found: list[dict[str, Any]]) -> str:
@@ -57,32 +148,6 @@ def variance_table(found: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def efficiency_table(found: list[dict[str, Any]]) -> str:
-    """Variance × seconds of every method, and how much better ours is than the best of the others."""
-    lines = [
-        "| case | method | pixel variance | seconds | variance x seconds | relative to ours | gain |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    ratios = []
-    for case in dict.fromkeys(row["case"] for row in found):
-        methods = [row for row in found if row["case"] == case]
-        ours = next(row for row in methods if row["method"] == "psdr_path")
-        peers = [row["cost"] / ours["cost"] for row in methods if row is not ours]
-        ratios += [min(peers)] if peers else []
-        for row in methods:
-            gain = f"{row['gain']:.3f} +- {row['gain_stderr']:.3f}"
-            lines.append(
-                f"| {describe(row)} | {row['method']} | {row['variance']:.2e} | {row['seconds']['median']:.3f} | "
-                f"{row['cost']:.2e} | {row['cost'] / ours['cost']:.3g} | {gain} |"
-            )
-    mean = math.exp(sum(math.log(r) for r in ratios) / len(ratios)) if ratios else float("nan")
-    return "\n".join(lines) + (
-        f"\n\nAgainst the best configuration of `prb_projective` in each case: {min(ratios):.3g} times to "
-        f"{max(ratios):.3g} times less variance x seconds, {mean:.3g} times in the geometric mean. The gain is "
-        "measured against finite differences: 1 is right."
-    )
-
-
 def check_table(found: list[dict[str, Any]]) -> str:
     """`psdr gradient --check` on one scene per phenomenon."""
     lines = ["| check against finite differences | gain | RMS z | max abs z | verdict |", "|---|---|---|---|---|"]
@@ -100,16 +165,6 @@ def convergence_table(found: list[dict[str, Any]]) -> str:
     for row in found:
         errors = " | ".join(f"{e:.2e}" for e in row["rmse"])
         lines.append(f"| {row['case']} | {errors} | {row['reference_error']:.1e} | {row['slope']:.3f} |")
-    return "\n".join(lines)
-
-
-def call_table(found: list[dict[str, Any]]) -> str:
-    """Seconds of a call."""
-    lines = ["| case | method | seconds a call |", "|---|---|---|"]
-    for row in found:
-        t = row["seconds"]
-        median, q1, q3 = t["median"], t["q1"], t["q3"]
-        lines.append(f"| {describe(row)} | {row['method']} | {median:.3f} ({q1:.3f} to {q3:.3f}) |")
     return "\n".join(lines)
 
 
@@ -147,14 +202,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="change nothing")
     args = parser.parse_args()
-    before = README.read_text(encoding="utf-8")
-    after = with_block(with_block(before, "support", support_table()), "bench", benchmark_tables())
-    if args.check:
-        if after != before:
-            print("README.md is out of date; run:  python -m benchmarks.report", file=sys.stderr)
-        return int(after != before)
-    README.write_text(after, encoding="utf-8")
-    return 0
+    if not args.check:
+        return write(rows.RESULTS)
+    stale = current() != README.read_text(encoding="utf-8")
+    stale |= (rows.RESULTS / "README.md").read_text(encoding="utf-8") != details(stored_rows(rows.RESULTS))
+    if stale:
+        print("README.md is out of date; run:  psdr bench --report", file=sys.stderr)
+    return int(stale)
 
 
 if __name__ == "__main__":

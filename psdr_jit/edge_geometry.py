@@ -14,6 +14,9 @@ import numpy as np
 
 from .mesh_edges import EdgeTopology
 
+UNIT_ROUNDOFF = 2.0**-24  # of float32, in which rays are traced
+MAX_BLUR = 1e-2  # of the longest side: a collapsed face is met nowhere
+
 
 @dataclass
 class EdgeTopologyDevice:
@@ -44,6 +47,7 @@ class EdgeGeometry:
     angle: mi.Float  # exterior dihedral angle [rad]: 0 coplanar, pi/2 on a cube, pi on a border
     convex: mi.Bool  # seen from the side of the normals, the surface bends away; False on a border
     border: mi.Bool
+    blur: mi.Float  # how far beside the edge a ray may still meet one of its faces, by rounding [m]
 
 
 def upload_topology(topology: EdgeTopology) -> EdgeTopologyDevice:
@@ -96,7 +100,19 @@ def edge_geometry(positions: mi.Point3f, faces: mi.Vector3u, topo_device: EdgeTo
         angle=dr.select(border, dr.pi, angle),
         convex=~border & (dr.dot(n0, q1 - p0) < 0),
         border=border,
+        blur=dr.maximum(_blur(p0, p1, q0), _blur(p0, p1, q1)),
     )
+
+
+def _blur(a: mi.Point3f, b: mi.Point3f, c: mi.Point3f) -> mi.Float:
+    """Rounding of a ray's barycentric coordinates on a triangle, as a length: ε L² / w for longest side L and width w.
+
+    It matters on slivers: 1e-5 of the length of one that is a thousand times as long as wide.
+    """
+    longest2 = dr.maximum(dr.squared_norm(b - a), dr.maximum(dr.squared_norm(c - b), dr.squared_norm(a - c)))
+    longest = dr.sqrt(longest2)
+    width = dr.norm(dr.cross(b - a, c - a)) / longest
+    return dr.minimum(UNIT_ROUNDOFF * longest2 / width, MAX_BLUR * longest)
 
 
 def _apex(positions: mi.Point3f, faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.Point3f:

@@ -21,9 +21,11 @@ class EdgeRows:
     n0: mi.Normal3f  # unit normals of the adjacent faces, consistently oriented across the edge
     n1: mi.Normal3f
     angle: mi.Float  # exterior angle [rad]
+    blur: mi.Float  # how far beside the edge a ray may still meet its faces, by rounding [m]
     border: mi.Bool
     seam: mi.Bool  # what the faces reflect may differ along the edge even where both are visible ...
     smooth: mi.Bool  # ... though they share shading normals: a face that turns away from a light is in its own shadow
+    pattern: mi.Bool  # ... by more than the angle between them explains: textures or shading normals are split
     traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
     moves: mi.Bool  # one of the faces can move
     junction: mi.UInt32  # 1 + row of the edge set's junctions; 0: an edge of a mesh

@@ -170,9 +170,11 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         n0=g.n0,
         n1=g.n1,
         angle=g.angle,
+        blur=g.blur,
         border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
         smooth=~jumps & _is_smooth(mesh),
+        pattern=jumps,
         traced=dr.full(mi.Bool, False, n),
         moves=dr.full(mi.Bool, moves, n),
         junction=dr.zeros(mi.UInt32, n),

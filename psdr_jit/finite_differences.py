@@ -8,7 +8,7 @@ chosen per parameter and recorded with the result.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,15 +95,20 @@ class CentralDifference:
         start = time.perf_counter()
         numbers = [self._next_seed + k for k in range(2 * seeds)]
         self._next_seed += 2 * seeds
+        for k, image in enumerate(self.differences(numbers)):
+            self.halves[k % 2].add(image)
+        self.seconds += time.perf_counter() - start
+
+    def differences(self, seeds: Sequence[int]) -> list[np.ndarray]:
+        """The central difference (H, W, C) of each seed: two renderings with the same random numbers."""
         self.perturbation.set_value(self.eps)
-        above = [self._render(n) for n in numbers]
+        above = [self._render(seed) for seed in seeds]
         self.perturbation.set_value(-self.eps)
+        below = [self._render(seed) for seed in seeds]
+        self.perturbation.restore()
         for image in above:
             self.primal.add(image)
-        for k, n in enumerate(numbers):
-            self.halves[k % 2].add((above[k] - self._render(n)) / (2 * self.eps))
-        self.perturbation.restore()
-        self.seconds += time.perf_counter() - start
+        return [(a - b) / (2 * self.eps) for a, b in zip(above, below, strict=True)]
 
     def _render(self, seed: int) -> np.ndarray:
         with dr.suspend_grad():

@@ -226,8 +226,9 @@ def _upload(found: list[tuple]) -> JunctionTable:
     edges = EdgeRows(
         v0=zeros, v1=zeros, apex0=zeros, apex1=zeros, p0=_point(start), p1=_point(end),
         n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
-        angle=mi.Float(angle), border=mi.Bool(np.zeros(count, bool)), seam=mi.Bool(np.ones(count, bool)),
-        smooth=mi.Bool(np.zeros(count, bool)), traced=mi.Bool(np.ones(count, bool)), moves=mi.Bool(moves),
+        angle=mi.Float(angle), blur=mi.Float(np.zeros(count, np.float32)), border=mi.Bool(np.zeros(count, bool)),
+        seam=mi.Bool(np.ones(count, bool)), smooth=mi.Bool(np.zeros(count, bool)),
+        pattern=mi.Bool(np.ones(count, bool)), traced=mi.Bool(np.ones(count, bool)), moves=mi.Bool(moves),
         junction=mi.UInt32(np.arange(1, count + 1, dtype=np.uint32)),
         shell0=mi.Float(np.where(arc, 0, a["shell"])), shell1=mi.Float(np.where(arc, 0, b["shell"])),
         shape0=_index(a["index"]), shape1=_index(np.where(b["is_ball"], a["index"], b["index"])),

@@ -97,6 +97,7 @@ class SceneFacts:
     sensor: SensorFacts
     enabled: tuple[str, ...]  # all parameters with gradients enabled, as `mi.traverse(scene)` names them
     extent: float  # diagonal of the scene's bounding box [scene units], 0 without shapes
+    reach: float  # largest coordinate of that box [scene units]
 
     @property
     def anything_enabled(self) -> bool:
@@ -178,6 +179,7 @@ def analyse(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> SceneFacts:
             sensor=_sensor_facts(graph, sensor),
             enabled=graph.enabled_names(),
             extent=_extent(scene),
+            reach=max(map(abs, [*scene.bbox().min, *scene.bbox().max])) if scene.bbox().valid() else 0.0,
         )
 
 

@@ -188,10 +188,11 @@ def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_extent(facts: SceneFacts) -> Iterator[Finding]:
-    """Mitsuba keeps rays off surfaces by absolute distances, and edges of that size blur."""
-    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE:
-        text = (f"the scene is only {facts.extent:.2g} units across, where Mitsuba's ray offsets (absolute lengths) "
-                "swallow a part of the derivative (1 % at 0.03, 9 % at 0.003); scale the scene up")  # fmt: skip
+    """Mitsuba keeps rays off surfaces by 1e-4 (1 + coordinates), and edges of that size blur."""
+    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE * max(1, facts.reach):
+        text = (f"the scene is only {facts.extent:.2g} units across, up to {facts.reach:.2g} from the origin: "
+                "Mitsuba's ray offsets swallow a part of the derivative (1 % at 0.03, 9 % at 0.003 units across); "
+                "scale the scene up, or move it to the origin")  # fmt: skip
         yield Finding(UnsupportedWarning, "", text)
 
 

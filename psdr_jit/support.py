@@ -105,6 +105,7 @@ SUPPORT = (
     Row("meshes that cut into each other, a sphere in a mesh", "yes", "the curve where they meet; not within one mesh"),
     Row("cylinders, disks and spheres that cut into other shapes", "warning", "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
+    Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),
 )  # fmt: skip
 
 

@@ -27,9 +27,8 @@ CONE_SHARE = 0.5
 #: Exterior angle from which a crease between two visible faces counts as much as a silhouette [rad].
 FULL_CREASE = dr.pi / 4
 
-#: Relevance of seams that have no angle to go by (textures, split normals).
+#: Least relevance of seams at which textures or shading normals are split: the angle does not tell how much.
 SEAM_RELEVANCE = 0.25
-SEAM_ANGLE = 1e-2
 
 #: Factor on creases of smooth-shaded meshes, which show near the terminator of a light only.
 SMOOTH_FACTOR = 0.25
@@ -48,9 +47,12 @@ class Wedges:
 
 
 def crease_relevance(e: EdgeRows) -> mi.Float:
-    """How much an edge matters where both of its faces are seen, relative to a silhouette."""
+    """How much an edge matters where both of its faces are seen, relative to a silhouette.
+
+    What two faces reflect differs by about their angle: the finer a mesh, the less each of its creases matters.
+    """
     crease = dr.clip(e.angle / FULL_CREASE, 0, 1) * dr.select(e.smooth, SMOOTH_FACTOR, 1)
-    crease = dr.select(~e.smooth & (e.angle < SEAM_ANGLE), dr.maximum(crease, SEAM_RELEVANCE), crease)
+    crease = dr.select(e.pattern, dr.maximum(crease, SEAM_RELEVANCE), crease)
     return dr.select(e.seam, crease, 0)
 
 

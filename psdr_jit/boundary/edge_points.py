@@ -23,13 +23,19 @@ from ..edge_set import EdgeSet, attached_positions
 from ..junction_points import bend, junction_motion
 from ..sensor_frame import SensorFrame, View, look_at, towards_viewer, viewpoint
 
-#: Sideways distance at which a ray that passes a straight edge is traced, relative to the coordinates: far above
-#: the rounding of float32 positions (1e-7), far below anything one can see.
+#: Sideways distance at which a ray that passes an edge is traced, relative to the distance from the scene's centre: far
+#: below anything one can see.
 SIDE_OFFSET = 1e-5
+
+#: What is added for the rounding of float32 positions, relative to the coordinates: eight units in the last place.
+ROUNDING = 1e-6
 
 #: The side rays start this many side offsets in front of the edge: an edge that rests on another surface is then
 #: seen against that surface, and the ray does not start beneath it.
 LEAD = 100.0
+
+#: The same for what rounding adds: far from the origin, a hundredfold is no small distance.
+ROUNDING_LEAD = 10.0
 
 #: The same for curved surfaces, as a fraction of the curve's own scale: a ray just inside a tangent point must start
 #: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
@@ -101,7 +107,20 @@ def segment_motion(edges: EdgeSet, row, t, active) -> mi.Vector3f:
     return dr.select(at_junction, junction_motion(edges.junctions, index, t, dr.detach(place), at_junction), motion)
 
 
-def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, active) -> tuple[Side, mi.Bool]:
+def clearance(x: mi.Point3f, size: mi.Float, centre: mi.Point3f, blur: mi.Float | float = 0.0):
+    """Steps off an edge at `x` [m]: `(sideways, along the line, clear of what the edge rests on)`.
+
+    `size`: of the edge or its shape; `centre`: of the scene, so that its place in space matters by rounding only;
+    `blur`: of the faces at the edge.
+    """
+    visible = SIDE_OFFSET * (dr.max(dr.abs(x - centre)) + size)
+    rounding = ROUNDING * dr.max(dr.abs(x)) + blur
+    return visible + rounding, LEAD * visible + ROUNDING_LEAD * rounding
+
+
+def segment_sides(
+    edges: EdgeSet, centre: mi.Point3f, row, t, point: EdgePoint, which: mi.UInt32, active
+) -> tuple[Side, mi.Bool]:
     """One side of a straight edge: `which` = 0 towards −`point.side`, 1 towards +`point.side`.
 
     Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than any
@@ -131,8 +150,8 @@ def segment_sides(edges: EdgeSet, row, t, point: EdgePoint, which: mi.UInt32, ac
     uv += fringe * (apex_uv(corners) - uv)
     pi.prim_uv = uv + INSET * (1 / 3 - uv)
 
-    offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + dr.norm(rows.p1 - rows.p0))
-    beside = point.x + towards * offset * point.side - LEAD * offset * ω
+    offset, lead = clearance(point.x, dr.norm(rows.p1 - rows.p0), centre, rows.blur)
+    beside = point.x + towards * offset * point.side - lead * ω
     ray = mi.Ray3f(dr.select(own, point.view.o, beside), ω)
     return Side(ray, pi, ~own), rows.border | silhouette | rows.seam | rows.traced
 
@@ -180,9 +199,9 @@ def curve_motion(curves: CurveSet, row, local: mi.Point3f, active) -> mi.Point3f
     return transform_point(attached_to_world(curves.shapes, shape), dr.detach(local))
 
 
-def curve_sides(point: EdgePoint, scale: mi.Float, which: mi.UInt32) -> Side:
+def curve_sides(point: EdgePoint, centre: mi.Point3f, scale: mi.Float, which: mi.UInt32) -> Side:
     """Rays just inside (`which` = 0) and outside (1) of a curve."""
-    offset = SIDE_OFFSET * (dr.max(dr.abs(point.x)) + scale)
+    offset, _ = clearance(point.x, scale, centre)
     towards = dr.select(which == 0, -1.0, 1.0)
     ray = mi.Ray3f(point.x + towards * offset * point.side - CURVE_LEAD * scale * point.view.ω, point.view.ω)
     return Side(ray, dr.zeros(mi.PreliminaryIntersection3f), mi.Bool(True))

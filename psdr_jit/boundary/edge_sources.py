@@ -18,7 +18,7 @@ from ..analytic_edges import (
 )
 from ..edge_rows import EdgeRows
 from .edge_directions import silhouette_wedges
-from .edge_points import CURVE_LEAD, LEAD, SIDE_OFFSET, contour_side
+from .edge_points import CURVE_LEAD, clearance, contour_side
 from .relevance import SecondaryEdges
 
 #: Share of the samples under a sky whose direction follows the edge instead of the emitter.
@@ -57,10 +57,8 @@ def source_from_segment(
     else:
         ds, value = _from_edge_or_sky(scene, edges, e, row, it, u, active)
     n, across, silhouette = _open_side(e, dx, ds.d)
-    offset = SIDE_OFFSET * (dr.max(dr.abs(it.p)) + length)
-    out = EdgeAndSource(
-        it.p, mi.Point3f(0), across, n, ds.d, ds.dist, value, offset, LEAD * offset, active & silhouette
-    )
+    offset, lead = clearance(it.p, length, edges.table.centre, e.blur)
+    out = EdgeAndSource(it.p, mi.Point3f(0), across, n, ds.d, ds.dist, value, offset, lead, active & silhouette)
     return out, ds
 
 
@@ -91,8 +89,8 @@ def _from_edge_or_sky(scene, edges: SecondaryEdges, e: EdgeRows, row, it, u, act
     ω = edges.sample_view(e, w, row, it.p, u, active)
     dx = mi.Vector3f(e.p1 - e.p0)
     n, _, silhouette = _open_side(e, dx, ω)
-    offset = SIDE_OFFSET * (dr.max(dr.abs(it.p)) + dr.norm(dx))
-    probe = mi.Ray3f(it.p + offset * n + LEAD * offset * ω, ω, 0, it.wavelengths)
+    offset, lead = clearance(it.p, dr.norm(dx), edges.table.centre, e.blur)
+    probe = mi.Ray3f(it.p + offset * n + lead * ω, ω, 0, it.wavelengths)
     ω = dr.select(scene.ray_test(probe, active & by_edge & silhouette), -ω, ω)
     free = dr.zeros(mi.DirectionSample3f, dr.width(ω))
     free.d, free.dist = ω, dr.opaque(mi.Float, 2 * scene.bbox().bounding_sphere().radius)
@@ -151,6 +149,6 @@ def source_from_curve(
     ds.emitter = emitter
 
     n, across, scale = contour_side(columns, local, ω)
-    offset = SIDE_OFFSET * (dr.max(dr.abs(x)) + scale)
+    offset, _ = clearance(x, scale, table.centre)
     valid = active & local.valid & (across > 0)
     return EdgeAndSource(x, local.x, across, n, ω, dist, value, offset, CURVE_LEAD * scale, valid), ds

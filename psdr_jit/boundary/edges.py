@@ -25,6 +25,7 @@ class EdgeTable:
     segments: EdgeSet
     curves: CurveSet
     curve_moves: mi.UInt32  # by CurveRows.shape: 1 if the shape can move
+    centre: mi.Point3f  # of the scene's bounding box
 
     @property
     def segment_count(self) -> int:
@@ -89,7 +90,8 @@ def _edge_table(job: Job) -> EdgeTable:
         rows.shell0 = rows.shell0 * dr.gather(mi.Float, outside, rows.shape0)
         rows.shell1 = rows.shell1 * dr.gather(mi.Float, outside, rows.shape1)
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
-    return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]))
+    centre = dr.opaque(mi.Point3f, list(job.scene.bbox().center()))
+    return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre)
 
 
 def edge_samples(job: Job, frame: SensorFrame, paths: int) -> int:
@@ -113,9 +115,9 @@ def sides(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, wh
     straight = row < table.segment_count
     side, differs = None, mi.Bool(True)
     if table.has_segments:
-        side, differs = segment_sides(table.segments, row, t, point, which, straight)
+        side, differs = segment_sides(table.segments, table.centre, row, t, point, which, straight)
     if table.has_curves:
-        on_curve = curve_sides(point, scale, which)
+        on_curve = curve_sides(point, table.centre, scale, which)
         side = on_curve if side is None else dr.select(straight, side, on_curve)
         differs |= ~straight
     ray = side.ray

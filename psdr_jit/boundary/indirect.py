@@ -41,9 +41,8 @@ from . import secondary
 from .edge_directions import wedge_measure, wedges
 from .edge_points import (
     CURVE_LEAD,
-    LEAD,
-    SIDE_OFFSET,
     EdgePoint,
+    clearance,
     contour_side,
     segment_position,
 )
@@ -96,7 +95,7 @@ def _line_on_segment(edges: SecondaryEdges, row, t, u, active) -> _Line:
     side = dr.cross(dx, ω)
     across = dr.norm(side)
     side = dr.select(across > 0, side / across, 0)
-    lead = LEAD * SIDE_OFFSET * (dr.max(dr.abs(x)) + dr.norm(dx))
+    _, lead = clearance(x, dr.norm(dx), edges.table.centre, e.blur)
     valid = active & (across > 0) & (pdf > 0)
     return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, pdf_reversed, lead, valid)
 
@@ -133,7 +132,7 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> EdgeVie
         line = on_curve if line is None else dr.select(straight, line, on_curve)
 
     # A tangent line starts beside a curved surface, not on it.
-    beside = dr.select(straight, 0, SIDE_OFFSET * (dr.max(dr.abs(line.x)) + line.scale)) * line.side
+    beside = dr.select(straight, 0, clearance(line.x, line.scale, table.centre)[0]) * line.side
     ω, side, pdf = line.ω, line.side, line.pdf_sa
     down = mi.Ray3f(line.x + beside - line.lead * ω, -ω, 0, wavelengths)
     pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)

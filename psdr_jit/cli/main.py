@@ -41,8 +41,10 @@ COMMANDS = {
     "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
     "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),
     "doctor": Command("psdr_jit.cli.doctor", "check Python, Mitsuba, Dr.Jit and LLVM", renders=False),
+    "bench": Command("psdr_jit.cli.bench", "measure accuracy, speed and stability (needs a clone)", renders=False),
     "test": Command("psdr_jit.cli.test", "run the test suite (needs a clone)", renders=False),
 }
+PASSED_ON = ("bench", "test")  # commands whose options are not ours to know
 
 
 def build_parser(wanted: str | None) -> argparse.ArgumentParser:
@@ -85,8 +87,8 @@ def dispatch(argv: list[str], restart: bool) -> int:
     """Parse and run."""
     wanted = next((word for word in argv if not word.startswith("-")), None)
     parser = build_parser(wanted)
-    if wanted == "test":  # pytest's options are not ours to know
-        args, args.pytest_args = parser.parse_args([wanted]), argv[argv.index(wanted) + 1 :]
+    if wanted in PASSED_ON:
+        args, args.rest = parser.parse_args([wanted]), argv[argv.index(wanted) + 1 :]
     else:
         args = parser.parse_args(argv)
     if COMMANDS[args.command].renders:

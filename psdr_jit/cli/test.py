@@ -21,26 +21,26 @@ EXIT_STATUS = {0: 0, 4: 2, 5: 2}  # pytest: all passed; wrong usage; nothing sel
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """For the help text only: `main` hands over everything that follows `test` unparsed."""
-    parser.add_argument("pytest_args", nargs="*", metavar="ARG", help="passed on to pytest")
+    parser.add_argument("rest", nargs="*", metavar="ARG", help="passed on to pytest")
 
 
-def checkout() -> Path:
-    """Root of the clone that this package was imported from."""
+def checkout(folder: str, command: str) -> Path:
+    """Root of the clone that this package was imported from; `folder` is in clones only, and `command` needs it."""
     root = Path(psdr_jit.__file__).resolve().parents[1]
-    if not (root / "pyproject.toml").is_file() or not (root / "tests").is_dir():
+    if not (root / "pyproject.toml").is_file() or not (root / folder).is_dir():
         raise SetupError(
-            "the tests are not part of the installed package; clone the repository and run:  ./psdr test"
+            f"the {folder} are not part of the installed package; clone the repository and run:  ./psdr {command}"
         )
     return root
 
 
 def run(args: argparse.Namespace) -> int:
     """pytest's verdict as one of ours; a crash or an error while collecting is a failed check."""
-    root = checkout()
+    root = checkout("tests", NAME)
     if importlib.util.find_spec("pytest") is None:
         raise SetupError(f"pytest is not installed; run:  {sys.executable} -m pip install -e '{root}[test]'")
     llvm.ensure_llvm()
-    given = [absolute(word, root) for word in args.pytest_args]
+    given = [absolute(word, root) for word in args.rest]
     environment = {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
     command = [sys.executable, "-m", "pytest", *given]
     status = subprocess.run(command, cwd=root, env=environment, check=False).returncode

@@ -1,0 +1,291 @@
+"""Baseline: unidirectional edge sampling, the secondary boundary found from a camera path.
+
+Before boundaries were sampled from the edge outwards, differentiable path tracers looked for them from where the path
+happened to be [Li et al. 2018, Differentiable Monte Carlo Ray Tracing through Edge Sampling, §4.2; Zhang et al. 2019,
+A Differential Theory of Radiative Transfer, §6]. `EdgeSampling` does that with our own edge table and our own interior
+and primary terms, so that it differs from `psdr_path` in nothing but where the secondary boundary is sampled.
+
+*Derivation.* A camera path x_1, x_2, … by BSDF sampling has throughput β_k at x_k, where
+
+    L_o(x_k) = ∫ f(ω) cosθ L_i(x_k, ω) dω
+
+and L_i jumps across the image of every edge on the sphere of directions. Reynolds' theorem [Zhang et al. 2019, Eq. 4]
+leaves an integral over that image, a curve with element |τ×ω| dl / r_B whose points move with s·(v_B − u_k) / r_B
+across themselves (s = τ×ω/|τ×ω|, ω from x_k to the edge point x_B, r_B their distance, v_B the edge's velocity, u_k
+that of x_k sliding along its ray, see `psdr_jit/interior.py`). With one edge point of density pdf_len per vertex,
+
+    β_k f cosθ (L_− − L_+) s·(v_B − u_k) |τ×ω| / (r_B² pdf_len)
+
+where L_∓ are the radiances from beside the edge on the side −s and +s, with common random numbers and *without* what
+the first vertex x_S beyond the edge emits. The interior term has that emission in material form, where an emitter's own
+outline does not move; so only what silhouettes hide of it counts, relative to the motion u_S of the emitter's points:
+
+    − β_k f cosθ L_e n·[(v_B − u_k) − (r_B / r_S) (u_S − u_k)] |τ×ω| / (r_B² pdf_len),    n = ±s, to the open side
+
+with r_S = |x_S − x_k|, and r_B / r_S = 0 for an environment. Both are the integrands of `boundary/indirect.py` and
+`boundary/direct.py`; only the measure is another: points of the receiver and the edge in place of the edge and a
+direction. The 1/r_B² is its weakness, and that the edge is drawn without regard to x_k: most are not seen from there,
+are no silhouettes, or do not move against x_k. Nothing aims at the light: silhouettes against a small one are rare.
+
+*Limits.* Straight edges only, forward mode only, no delta lights (whether the line through x_k and x_B ends on one has
+probability 0). Li et al. choose edges near x_k more often by a hierarchy; here one distribution, weight length ×
+exterior angle, serves the whole scene. With edges by the thousand, theirs is better than this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from psdr_jit import film as films
+from psdr_jit.ad import tangents
+from psdr_jit.boundary.edge_points import LEAD, SIDE_OFFSET, EdgePoint, segment_position
+from psdr_jit.boundary.edge_sources import _open_side
+from psdr_jit.boundary.edges import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
+from psdr_jit.edge_distribution import EdgeDistribution, pmf, sample_edge
+from psdr_jit.edge_rows import EdgeRows
+from psdr_jit.errors import UnsupportedError
+from psdr_jit.interior_term import _camera_passes
+from psdr_jit.job import Job
+from psdr_jit.low_discrepancy import pixel_sampler
+from psdr_jit.path_steps import SHADOW_EPSILON, NoSink, PathLimits, continue_path, first_hit, walk
+from psdr_jit.records import Hit
+from psdr_jit.scattering import sample_scattering
+from psdr_jit.scene_analysis import SceneFacts
+from psdr_jit.sensor_frame import View
+from psdr_jit.streams import Stream, stream_seed
+
+#: Exterior angle that seams without one (split textures or normals) get, so that they are sampled at all [rad].
+LEAST_ANGLE = 1e-2
+
+
+class EdgeSampling:
+    """Derivative images with the secondary boundary from camera paths; options as of `psdr_path`.
+
+    `spp`: camera paths per pixel of every term. Each vertex of a path but the last draws one edge point.
+    """
+
+    def __init__(self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False):
+        limits = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
+        self._others = mi.load_dict({"type": "psdr_path", "sppd": 0, "sppi": 0, **limits})
+
+    @property
+    def stats(self) -> dict:
+        return self._others.stats
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> mi.TensorXf:
+        """Derivative image along the tangents set on the scene's parameters. Detached."""
+        jobs = self._others.jobs(scene, sensor, seed, spp)
+        for _, job in jobs:
+            require_supported(job.facts)
+        images = [term.forward(job) for term, job in jobs]
+        interior = [job for term, job in jobs if term.name == "interior" and job.facts.geometry_moves]
+        images += [secondary_boundary(job) for job in interior]
+        if not images:
+            return self._others.render_forward(scene, params, sensor, seed, spp)
+        return sum(images[1:], images[0])
+
+
+def require_supported(facts: SceneFacts) -> None:
+    """Raise for lights whose shadows this method cannot find."""
+    names = [f"'{e.name}' ({e.plugin})" for e in facts.emitters if e.delta]
+    if names and facts.geometry_moves:
+        raise UnsupportedError(
+            f"edge sampling from camera paths cannot find the shadow edges of {', '.join(names)}: that the line "
+            "through a path vertex and an edge point meets a point or a single direction has probability 0; use "
+            "psdr_path, or an area light"
+        )
+
+
+def scene_distribution(table: EdgeTable) -> EdgeDistribution | None:
+    """All straight edges, weight length × exterior angle."""
+    if table.has_curves:
+        raise UnsupportedError(
+            "edge sampling from camera paths has no outlines of spheres, cylinders and disks, which depend on the "
+            "viewer; use psdr_path, or meshes in their place"
+        )
+    if not table.has_segments:
+        return None
+    rows = table.segments.rows
+    jumps = rows.seam | rows.border | rows.traced
+    angle = dr.maximum(rows.angle, dr.select(jumps, LEAST_ANGLE, 0))
+    return distribution_of([dr.norm(rows.p1 - rows.p0) * angle])
+
+
+@dataclass
+class CameraPath:
+    """How a camera path arrives at its present vertex. Detached, one entry per path that goes on."""
+
+    lane: mi.UInt32
+    hit: Hit
+    o_grad: mi.Vector3f  # tangents of the ray
+    d_grad: mi.Vector3f
+    β: mi.Spectrum
+    η: mi.Float
+    wavelengths: mi.Color0f
+
+
+@dataclass
+class EdgeView:
+    """An edge point that a path vertex sees. Detached, one entry per kept sample."""
+
+    lane: mi.UInt32
+    row: mi.UInt32
+    t: mi.Float
+    x: mi.Point3f  # x_B
+    v: mi.Vector3f  # its velocity
+    u: mi.Vector3f  # that of x_k
+    ω: mi.Vector3f  # from x_k to x_B
+    r: mi.Float
+    side: mi.Vector3f  # s
+    passes: mi.UInt32  # the side on which light passes a silhouette: 0 (−s) or 1 (+s); 2: no silhouette
+    weight: mi.Spectrum  # β f cosθ |τ×ω| / (r² pdf)
+    wavelengths: mi.Color0f
+
+
+def secondary_boundary(job: Job) -> mi.TensorXf:
+    """Derivative image of direct and indirect boundary together. Detached."""
+    image = films.black(job.film)
+    with dr.suspend_grad():
+        table = scene_edges(job)
+        dist = scene_distribution(table)
+        if dist is None:
+            return image
+        for p in _camera_passes(job):
+            dL = job.rejected.keep_finite(along_paths(job, table, dist, p))
+            dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
+            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+    return image
+
+
+def along_paths(job: Job, table: EdgeTable, dist: EdgeDistribution, p) -> mi.Spectrum:
+    """Derivative of the radiance of every camera ray of the pass `p` by its secondary boundaries."""
+    dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+    path = first_arrivals(job, p)
+    k = 1  # the vertex: x_k
+    # one segment is left for the emitter
+    while k < job.options.depth_limit and dr.width(path.lane) > 0:
+        seed = mi.sample_tea_32(p.seed, mi.UInt32(k))[0]
+        si, u = arrive(path)
+        view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.spp)
+        if dr.width(view.lane) > 0:
+            rng = stream_seed(seed, Stream.INDIRECT_RADIANCE)
+            dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.spp))
+        if k + 1 < job.options.depth_limit:
+            path = go_on(job, path, si, u, k, stream_seed(seed, Stream.INDIRECT_SUBPATH), p.spp)
+        k += 1
+    return dL
+
+
+def first_arrivals(job: Job, p) -> CameraPath:
+    """Camera rays that meet a surface."""
+    n = dr.width(p.pos)
+    o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+    if job.facts.camera_moves:
+        with dr.resume_grad():
+            o_grad, d_grad = (mi.Vector3f(g) for g in tangents(p.ray.o, p.ray.d))
+    start = mi.Ray3f(dr.detach(p.ray))
+    ray, pi, _ = first_hit(job.scene, start, job.options.hide_emitters)
+    path = CameraPath(
+        lane=dr.arange(mi.UInt32, n),
+        hit=Hit.of(ray, pi),
+        o_grad=o_grad + dr.dot(ray.o - start.o, start.d) * d_grad + dr.zeros(mi.Vector3f, n),
+        d_grad=d_grad + dr.zeros(mi.Vector3f, n),
+        β=dr.full(mi.Spectrum, 1, n),
+        η=dr.full(mi.Float, 1, n),
+        wavelengths=ray.wavelengths,
+    )
+    return compact(path, pi.is_valid())
+
+
+def arrive(path: CameraPath) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+    """The vertex, and its velocity u_k by motion transport: `(si, u)`, both detached."""
+    with dr.resume_grad():
+        o, d = mi.Point3f(path.hit.o), mi.Vector3f(path.hit.d)
+        dr.enable_grad(o, d)
+        dr.set_grad(o, path.o_grad)
+        dr.set_grad(d, path.d_grad)
+        ray = mi.Ray3f(o, d, 0, path.wavelengths)
+        si = path.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
+        u = mi.Vector3f(tangents(si.p))
+    return dr.detach(si), u
+
+
+def sample_view(job: Job, table: EdgeTable, dist: EdgeDistribution, path: CameraPath, si, u, seed, spp) -> EdgeView:
+    """One edge point per vertex; kept if the vertex sees it, scatters light from there, and they move apart."""
+    rng = pixel_sampler(seed, path.lane, spp)
+    row, t = sample_edge(dist, mi.Float64(rng.next_1d()))
+    e = dr.gather(EdgeRows, table.segments.rows, row)
+    x, dx = segment_position(table.segments, row, t, mi.Bool(True))
+    with dr.resume_grad():
+        v = mi.Vector3f(tangents(edge_motion(table, row, t, mi.Point3f(0))))
+
+    offset = mi.Vector3f(x - si.p)
+    r = dr.norm(offset)
+    ω = offset / r
+    side = dr.cross(dx, ω)
+    speed_of_t = dr.norm(side)
+    side = dr.select(speed_of_t > 0, side / speed_of_t, 0)
+    n, _, silhouette = _open_side(e, dx, ω)
+    silhouette &= e.junction == 0  # where surfaces cut into each other, nothing passes
+
+    lead = LEAD * SIDE_OFFSET * (dr.max(dr.abs(x)) + dr.norm(dx))
+    active = (speed_of_t > 0) & (r > lead) & ((dr.dot(side, v - u) != 0) | sources_move(job.facts))
+    bsdf = si.bsdf()
+    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+    weight = path.β * f * speed_of_t / (dr.square(r) * pmf(dist, row))
+    active &= dr.any(weight != 0)
+    # From the edge: where it rests on a surface, a ray to it would end beside it.
+    back = mi.Ray3f(x - lead * ω, -ω, 0, path.wavelengths)
+    back.maxt = (r - lead) * (1 - SHADOW_EPSILON)
+    active &= ~job.scene.ray_test(back, active)
+    passes = dr.select(silhouette, dr.select(dr.dot(n, side) > 0, mi.UInt32(1), 0), 2)
+    return compact(EdgeView(path.lane, row, t, x, v, u, ω, r, side, passes, weight, path.wavelengths), active)
+
+
+def sources_move(facts: SceneFacts) -> bool:
+    """Shadows move though neither edge nor receiver does."""
+    return any(s.moves and s.is_emitter for s in facts.shapes)
+
+
+def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp: int) -> tuple[mi.Spectrum, mi.UInt32]:
+    """Both sides of every edge point, at most `segments` from x_k on: `(contribution, camera path)`, 2 lanes each."""
+    index = dr.arange(mi.UInt32, 2 * dr.width(view.row))
+    which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
+    x_k = v.x - v.r * v.ω
+    seen = View(mi.Point2f(0), mi.Point2f(0), x_k, v.ω, v.r, mi.Float(0), mi.Bool(True))
+    point = EdgePoint(v.x, seen, v.side, mi.Float(1), mi.Bool(True))
+    ray, pi, differs = sides(job.scene, table, v.row, v.t, point, mi.Float(0), which, v.wavelengths)
+    speed = dr.dot(v.side, v.v - v.u)
+    value = dr.zeros(mi.Spectrum, dr.width(index))
+    if segments > 1:
+        limits = PathLimits(segments, job.options.rr_depth)
+        rng = pixel_sampler(seed, v.lane, spp)
+        L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), mi.Bool(False), differs)
+        value += L * speed
+
+    shines = differs & (which == v.passes)
+    with dr.resume_grad():
+        flags = mi.RayFlags.All | mi.RayFlags.FollowShape
+        si = pi.compute_surface_interaction(ray, flags, shines)
+        u_source = mi.Vector3f(tangents(si.p))
+    si = dr.detach(si)
+    ratio = dr.select(si.is_valid(), v.r / dr.norm(si.p - x_k), 0)
+    relative = dr.select(si.is_valid(), ratio * dr.dot(v.side, u_source - v.u), 0)
+    value += dr.select(shines, si.emitter(job.scene).eval(si, shines) * (speed - relative), 0)
+    return v.weight * value * dr.select(which == 0, 1.0, -1.0), v.lane
+
+
+def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath:
+    """To the next vertex, by BSDF sampling with roulette; paths that end are left out."""
+    rng = pixel_sampler(seed, path.lane, spp)
+    bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), rng.next_1d(), rng.next_2d(), 0.0, mi.Bool(True))
+    vertex = mi.UInt32(k - 1)
+    β, η, alive, _ = continue_path(rng, path.β * bs.weight, path.η * bs.η, vertex, job.options.rr_depth)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    alive &= bs.pdf > 0
+    pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=alive)
+    following = CameraPath(path.lane, Hit.of(ray, pi), u, dr.zeros(mi.Vector3f, dr.width(u)), β, η, path.wavelengths)
+    return compact(following, alive & pi.is_valid())

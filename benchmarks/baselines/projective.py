@@ -1,0 +1,50 @@
+"""Mitsuba's own integrators at their best: configurations, and meshes welded where seams would pass for borders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks import meshes
+from psdr_jit.perturbation import Perturbation, perturb
+
+#: A guide that costs less to build: `prb_projective` reads these from its attributes, not from XML.
+SMALL_OCTREE = {"proj_seed_spp": 16, "octree_extra_leaf_sample": 8, "octree_max_depth": 6}
+WELD_DIGITS = 6  # decimals, relative to the size of the mesh, to which equal positions agree
+
+
+def integrator(spec: dict[str, Any], tuning: dict[str, Any]) -> Any:
+    built = mi.load_dict(spec)
+    for name, value in tuning.items():
+        if not hasattr(built, name):
+            raise AttributeError(f"{spec['type']} has no attribute '{name}'")
+        setattr(built, name, value)
+    return built
+
+
+def has_seams(motion: Perturbation) -> bool:
+    """The mesh that moves stores positions twice for no better reason than flat shading."""
+    shape = motion.params.properties[motion.name][2]
+    if not motion.name.endswith("vertex_positions") or not isinstance(shape, mi.Mesh):
+        return False
+    textured = any(name.startswith(f"{shape.id()}.") and name.endswith(".data") for name in motion.params.keys())
+    return not textured and len(_weld(shape)[0]) < shape.vertex_count()
+
+
+def welded(motion: Perturbation, how: dict[str, Any]) -> Perturbation:
+    """The same scene with the mesh that moves welded by position, and the same motion of it."""
+    moving = motion.params.properties[motion.name][2]
+    return perturb(meshes.replaced(motion.scene, moving.id(), *_weld(moving)), motion.name, **how)
+
+
+def _weld(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct positions (V, 3), and the faces (F, 3) that refer to them."""
+    params = mi.traverse(mesh)
+    points = np.array(dr.detach(params["vertex_positions"])).reshape(-1, 3)
+    faces = np.array(params["faces"]).reshape(-1, 3)
+    grid = np.round((points - points.min(0)) / np.ptp(points), WELD_DIGITS)
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return points[first], inverse.ravel()[faces]

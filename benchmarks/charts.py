@@ -1,0 +1,216 @@
+"""Charts from stored rows and images. Computes nothing that a row does not say. Readable in grayscale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import accuracy, cases, references
+
+DPI = 200
+INK, LIGHT = "0.15", "0.75"
+#: method -> (colour, line style, marker); luminance and dashes tell them apart without colour.
+STYLES = {
+    "psdr_path": ("#000000", "-", "o"),
+    "prb": ("#8c8c8c", ":", "x"),
+    "prb_projective, no guiding": ("#c1272d", "--", "s"),
+    "prb_projective, small octree": ("#e07b00", "-.", "^"),
+    "prb_projective, default octree": ("#b8860b", ":", "v"),
+    "direct_projective, small octree": ("#7a5195", "--", "D"),
+    "finite differences": ("#2a7f9e", "-", "+"),
+    "edge sampling": ("#3a7d44", "-.", "*"),
+    "prb_reparam": ("#5b7fd4", "--", "P"),
+    "path (primal)": ("#8c8c8c", "-", "x"),
+    "psdr_path forward": ("#000000", "--", "o"),
+    "psdr_path backward": ("#000000", "-", "o"),
+    "prb backward": ("#2a7f9e", ":", "v"),
+    "prb_projective backward, no guiding": ("#c1272d", "--", "s"),
+}  # fmt: skip
+PICTURED = ("area shadow", "cbox contact", "branching", "rough glass, spot moved")
+PICTURED_METHODS = ("psdr_path", "prb_projective, small octree", "prb_projective, no guiding", "edge sampling",
+                    "prb_reparam", "finite differences")  # fmt: skip
+PANEL_COLUMNS = 5
+GAIN_LIMITS = (-0.1, 2.1)  # of the axis; what lies outside is drawn at its edge
+RATIOS = (
+    "best prb_projective / psdr_path\n"
+    "filled circle: variance × seconds; open circle: the same where the peer misses more than half\n"
+    "of the derivative or doubles it; diamond: mean squared error after 10 s"
+)
+TARGET, LEAST = 50, 5  # ratios of variance × seconds that the project wants on average and everywhere
+
+
+def plain_axes(axis: Any) -> None:
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    axis.tick_params(labelsize=6, width=0.5, length=2)
+    for side in ("left", "bottom"):
+        axis.spines[side].set_linewidth(0.5)
+
+
+def panels(count: int, height: float) -> tuple[Any, list[Any]]:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    lines = -(-count // PANEL_COLUMNS)
+    columns = min(count, PANEL_COLUMNS)
+    figure, axes = plt.subplots(lines, columns, figsize=(2.1 * columns, height * lines), squeeze=False)
+    flat = list(axes.ravel())
+    for axis in flat[count:]:
+        axis.set_visible(False)
+    for axis in flat[:count]:
+        plain_axes(axis)
+    return figure, flat[:count]
+
+
+def save(figure: Any, path: Path) -> Path:
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+    return path
+
+
+def legend(figure: Any, handles: dict[str, Any], columns: int) -> None:
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns, fontsize=7, frameon=False)
+
+
+def draw(axis: Any, method: str, x: Sequence[float], y: Sequence[float]) -> Any:
+    colour, style, marker = STYLES[method]
+    width = 1.4 if method.startswith("psdr_path") else 0.9
+    (line,) = axis.plot(x, y, color=colour, linestyle=style, marker=marker, markersize=3, linewidth=width)
+    return line
+
+
+def error_against_time(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Relative RMSE of cumulative means against seconds; the dotted line is the error of the reference itself."""
+    done = [row for row in rows if row["status"] == "ok"]
+    names = list(dict.fromkeys(row["case"] for row in done))
+    figure, axes = panels(len(names), 1.8)
+    handles: dict[str, Any] = {}
+    for axis, name in zip(axes, names, strict=True):
+        for row in (row for row in done if row["case"] == name):
+            x, y = ([point[key] for point in row["curve"]] for key in ("seconds", "rmse"))
+            handles.setdefault(row["method"], draw(axis, row["method"], x, y))
+            axis.axhline(row["floor"], color=LIGHT, linestyle=":", linewidth=0.7)
+        axis.set(xscale="log", yscale="log")
+        axis.set_title(name, fontsize=7, color=INK, pad=3)
+        axis.minorticks_off()
+    figure.supxlabel("seconds of rendering", fontsize=8, y=0.055)
+    figure.supylabel("relative RMSE of the derivative image", fontsize=8)
+    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    legend(figure, {k: handles[k] for k in STYLES if k in handles}, 5)
+    return save(figure, path)
+
+
+def ratios(summary: list[dict[str, Any]], path: Path) -> Path:
+    """How much better than the best `prb_projective` each case is, in variance × seconds and in error after 10 s."""
+    figure, (axis,) = panels(1, 0.22 * len(summary) + 1.2)
+    figure.set_figwidth(7)
+    heights = np.arange(len(summary))[::-1]
+    for height, line in zip(heights, summary, strict=True):
+        axis.plot([line["cost_ratio"]], [height], "o", color="black", markersize=4,
+                  markerfacecolor="black" if line["does_it"] else "white")
+        axis.plot([line["mse_ratio"]], [height], "D", color="#c1272d", markersize=4, markerfacecolor="none")
+    axis.set(xscale="log", yticks=heights)
+    axis.set_yticklabels([line["case"] for line in summary])
+    for x, text in ((1, "equal"), (LEAST, f"{LEAST}x"), (TARGET, f"{TARGET}x")):
+        axis.axvline(x, color=LIGHT, linewidth=0.7)
+        axis.text(x, len(summary) - 0.4, text, fontsize=6, ha="center", color=INK)
+    axis.set_xlabel(RATIOS, fontsize=7)
+    figure.tight_layout()
+    return save(figure, path)
+
+
+def derivative_images(folder: Path, path: Path) -> Path | None:
+    """Mean derivative image of each method after an equal time, over its signed error; one scale per case."""
+    chosen = [case for case in cases.CASES
+              if case.name in PICTURED and references.path_of(folder, case).is_file()
+              and accuracy.image_path(folder, case).is_file()]  # fmt: skip
+    if not chosen:
+        return None
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    columns = 1 + len(PICTURED_METHODS)
+    figure, axes = plt.subplots(2 * len(chosen), columns, figsize=(1.25 * columns, 2.55 * len(chosen) + 0.7),
+                                squeeze=False)  # fmt: skip
+    for axis in axes.ravel():
+        axis.set(xticks=[], yticks=[])
+        axis.set_frame_on(False)
+    for k, case in enumerate(chosen):
+        truth = references.read(folder, case).mean.mean(-1)
+        stored = dict(np.load(accuracy.image_path(folder, case)))
+        limit = np.percentile(np.abs(truth), 99.5) or np.abs(truth).max()
+        look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "interpolation": "nearest"}
+        shown = axes[2 * k, 0].imshow(truth, **look)
+        axes[2 * k, 0].set_ylabel(case.name, fontsize=7)
+        bar = figure.colorbar(shown, ax=axes[2 * k + 1, 0], location="left", fraction=0.12, pad=-0.6)
+        bar.ax.tick_params(labelsize=5)
+        bar.set_label("d radiance / d unit", fontsize=5)
+        for column, method in enumerate(PICTURED_METHODS, start=1):
+            if method in stored:
+                axes[2 * k, column].imshow(stored[method], **look)
+                axes[2 * k + 1, column].imshow(stored[method] - truth, **look)
+            else:
+                axes[2 * k, column].text(0.5, 0.5, "cannot", ha="center", fontsize=7, color=INK)
+        axes[2 * k + 1, 1].set_ylabel("error", fontsize=7)
+    for column, name in enumerate(("reference", *PICTURED_METHODS)):
+        axes[0, column].set_title(name.replace(", ", ",\n"), fontsize=6)
+    figure.tight_layout(pad=0.3)
+    return save(figure, path)
+
+
+def stability(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Gain along each sweep; 1 is right. A cross at the lower edge: the method cannot do that step."""
+    names = list(dict.fromkeys(row["sweep"] for row in rows if "sweep" in row))
+    figure, axes = panels(len(names), 1.7)
+    handles: dict[str, Any] = {}
+    for axis, name in zip(axes, names, strict=True):
+        steps = list(dict.fromkeys(row["value"] for row in rows if row.get("sweep") == name))
+        axis.axhspan(0.95, 1.05, color="0.88", linewidth=0)
+        for method in dict.fromkeys(row["method"] for row in rows if row.get("sweep") == name):
+            of_method = {row["value"]: row for row in rows if row.get("sweep") == name and row["method"] == method}
+            x = [k for k, value in enumerate(steps) if of_method.get(value, {}).get("status") == "ok"]
+            y = np.clip([of_method[steps[k]]["gain"] for k in x], *GAIN_LIMITS)
+            handles.setdefault(method, draw(axis, method, x, y))
+            missing = [k for k, value in enumerate(steps) if of_method.get(value, {}).get("status") == "cannot"]
+            axis.plot(missing, [GAIN_LIMITS[0]] * len(missing), "x", color=STYLES[method][0], markersize=4)
+        axis.set_ylim(GAIN_LIMITS[0] - 0.05, GAIN_LIMITS[1] + 0.05)
+        axis.set_xticks(range(len(steps)), [f"{value:g}" for value in steps], fontsize=5)
+        axis.set_title(name, fontsize=7, color=INK, pad=3)
+    figure.supylabel("gain against finite differences", fontsize=8)
+    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    legend(figure, handles, 3)
+    return save(figure, path)
+
+
+def costs(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Milliseconds (upper line of panels) and MiB (lower) of a call along each sweep."""
+    done = [row for row in rows if row["status"] == "ok"]
+    names = list(dict.fromkeys(row["sweep"] for row in done))
+    figure, axes = panels(2 * len(names), 1.8)
+    handles: dict[str, Any] = {}
+    for k, name in enumerate(names):
+        for method in dict.fromkeys(row["method"] for row in done if row["sweep"] == name):
+            steps = [row for row in done if row["sweep"] == name and row["method"] == method]
+            x = [row["value"] for row in steps]
+            line = draw(axes[k], method, x, [row["wall_ms"]["median"] for row in steps])
+            draw(axes[k + len(names)], method, x, [row["peak_mib"] for row in steps])
+            handles.setdefault(method, line)
+        for axis in (axes[k], axes[k + len(names)]):
+            axis.set(xscale="log", yscale="log")
+            axis.minorticks_off()
+            axis.set_title(name, fontsize=7, color=INK, pad=3)
+    axes[0].set_ylabel("ms per call", fontsize=7)
+    axes[len(names)].set_ylabel("peak memory [MiB]", fontsize=7)
+    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    legend(figure, handles, 5)
+    return save(figure, path)

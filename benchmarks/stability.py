@@ -1,0 +1,168 @@
+"""Suite `stability`: one thing at a time is driven towards where methods fail; the table shows where each breaks.
+
+A step of a sweep is a case like any other. Its truth is a central difference of `path` of that very step, except where
+a sweep says that all of its steps have one and the same derivative: size and place of the whole scene. There the first
+step is the truth of all, in which no small number meets a large one. With the gaussian filter an image is a smooth
+function of where an edge is, so that a difference over a tenth of a pixel is a derivative.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from benchmarks import cases, figures, meshes, methods
+from benchmarks.accuracy import LOAD, figures_of
+from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
+from benchmarks.measure import CannotRenderError
+from benchmarks.suites import Settings
+from psdr_jit.finite_differences import CentralDifference
+
+NAME = "stability"
+RES = 32
+REFERENCE_BUDGETS = 4.0
+SLOWEST_FIRST_RENDER = 45.0  # [s]
+METHODS = ("psdr_path", "prb_projective, no guiding", "prb_projective, small octree")
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """`step(value)` is the case at that value; `unit` is for the table's head."""
+
+    name: str
+    unit: str
+    values: Sequence[float]
+    step: Callable[[float], Case]
+    one_truth: Case | None = None  # every step has the derivative of this case
+
+
+def shadow(**load: Any) -> Case:
+    return Case("", "stress_shadow", BLOCKER, 2, X, load=load)
+
+
+def of_mesh(mesh: Callable[[], tuple]) -> Case:
+    return replace(shadow(), mesh=mesh)
+
+
+def cornell(depth: int, lift: float) -> Case:
+    return Case("", "cbox", SMALL_BOX, depth, X, load={"lift": lift})
+
+
+ORIGIN, TARGET = np.array([0.7, 2.2, 4.0]), np.array([0.0, -0.5, 0.0])
+FLOOR, DISTANCE = -1.0, 4.0  # height of the floor; of the camera from the target
+
+
+def placed(size: float, shift: float) -> Case:
+    """The whole scene, camera included, scaled and then moved along x; the motion is scaled as well."""
+    points = {"origin": ORIGIN * size + [shift, 0, 0], "target": TARGET * size + [shift, 0, 0]}
+    text = {name: ", ".join(f"{x:.9g}" for x in point) for name, point in points.items()}
+    lengths = {"size": size, "shift": shift, "near": 0.01 * size, "far": 1e4 * size}
+    return replace(shadow(**text, **lengths), direction=(size, 0, 0))
+
+
+def seen_from(degrees: float) -> Case:
+    """Camera at an elevation over the floor, at which it looks where the shadow falls."""
+    angle = np.deg2rad(degrees)
+    target = np.array([0.0, FLOOR, 0.0])
+    origin = target + DISTANCE * np.array([0.0, np.sin(angle), np.cos(angle)])
+    text = {name: ", ".join(f"{x:.9g}" for x in point) for name, point in (("origin", origin), ("target", target))}
+    return shadow(**text)
+
+
+def lit_from(degrees: float) -> Case:
+    horizontal = np.hypot(0.3, 0.2)
+    load = {"down": -horizontal * np.tan(np.deg2rad(degrees))}
+    return Case("", "directional_shadow", "blocker.to_world", 2, X, load=load)
+
+
+SWEEPS = (
+    Sweep("contact distance", "height of the box [units]", (0.1, 0.01, 1e-3, 1e-4, 0.0, -1e-3, -0.01),
+          lambda lift: cornell(3, lift)),
+    Sweep("light size", "half side [units]", (0.4, 0.1, 0.03, 0.01, 0.001), lambda size: shadow(light_size=size)),
+    Sweep("roughness", "alpha", (0.5, 0.2, 0.1, 0.05, 0.02),
+          lambda alpha: Case("", "glossy_floor", BLOCKER, 3, X, load={"alpha": alpha})),
+    Sweep("triangles", "count", (1e3, 1e4, 1e5, 1e6), lambda n: of_mesh(partial(meshes.round_ball, int(n)))),
+    Sweep("nearly coplanar faces", "height of the bumps [edge lengths]", (1e-1, 1e-2, 1e-4, 1e-6, 0.0),
+          lambda bulge: of_mesh(partial(meshes.box, 8, bulge))),
+    Sweep("slivers", "triangles around a ball of 3 rings", (8, 64, 512, 4096),
+          lambda n: of_mesh(partial(meshes.ball, 3, int(n)))),
+    Sweep("grazing view", "elevation of the camera [degrees]", (45, 20, 10, 5, 2), seen_from),
+    Sweep("grazing light", "elevation of the light [degrees]", (60, 30, 15, 8, 4), lit_from),
+    Sweep("scene size", "factor", (1.0, 1e3, 10.0, 0.1, 0.01, 1e-3), lambda size: placed(size, 0.0), placed(1.0, 0.0)),
+    Sweep("scene offset", "units", (0.0, 10.0, 100.0, 1e3, 1e4), lambda shift: placed(1.0, shift), placed(1.0, 0.0)),
+    Sweep("path length", "max_depth", (2, 3, 4, 6, 8, 12), lambda depth: cornell(int(depth), 0.06)),
+)  # fmt: skip
+QUICK = ("contact distance", "scene offset")
+
+
+@dataclass
+class Opened:
+    sweep: Sweep
+    value: float
+    problem: methods.Problem
+    settings: Settings
+    reference: figures.Reference | None = None
+    reference_row: dict[str, Any] | None = None
+
+
+def case_name(sweep: Sweep, value: float) -> str:
+    return f"{sweep.name} {value:g}"
+
+
+def case_names() -> list[str]:
+    return [case_name(sweep, value) for sweep in SWEEPS for value in sweep.values]
+
+
+def quick_case_names() -> list[str]:
+    return [case_name(sweep, value) for sweep in SWEEPS if sweep.name in QUICK for value in sweep.values[::2]]
+
+
+def method_names(case: str) -> list[str]:
+    return list(METHODS)
+
+
+def open_case(name: str, settings: Settings) -> Opened:
+    sweep, value = next((s, v) for s in SWEEPS for v in s.values if case_name(s, v) == name)
+    step = replace(sweep.step(value), name=name)
+    return Opened(sweep, value, methods.Problem(step, cases.load(step, RES, **LOAD), {"res": RES, **LOAD}), settings)
+
+
+def reference_of(opened: Opened) -> figures.Reference:
+    """Central differences of this step, or of the case that has the same derivative; made once per process."""
+    if opened.reference is None:
+        truth = opened.sweep.one_truth
+        case = opened.problem.case if truth is None else truth
+        motion = opened.problem.motion if truth is None else cases.load(truth, RES, **LOAD)
+        difference = CentralDifference(motion, case.limits)
+        start = time.perf_counter()
+        while difference.seeds < 8 or time.perf_counter() - start < REFERENCE_BUDGETS * opened.settings.budget:
+            difference.add(2)
+        one, two = (half.group_means() for half in difference.halves)
+        squared_error = float(np.mean(np.concatenate([one, two]).var(axis=0, ddof=1)) / (len(one) + len(two)))
+        opened.reference = figures.Reference(np.stack([one.mean(0), two.mean(0)]), squared_error, (one, two))
+        opened.reference_row = {"eps": difference.eps, "spp": difference.spp, "seeds": 2 * difference.seeds}
+    return opened.reference
+
+
+def measure(opened: Opened, method_name: str) -> dict[str, Any]:
+    """The row of one method at one step, without circumstances."""
+    method = next(method for method in methods.METHODS if method.name == method_name)
+    problem, case = opened.problem, opened.problem.case
+    row = {
+        "bench": NAME, "case": case.name, "method": method.name, "family": method.family, "sweep": opened.sweep.name,
+        "value": opened.value,
+        "settings": {**problem.load, **case.limits, **case.load, **method.settings, "spp": method.spp,
+                     "parameter": case.param, "motion": problem.motion.label, "budget": opened.settings.budget},
+    }  # fmt: skip
+    try:
+        renders = methods.measure(method, problem, opened.settings.budget, SLOWEST_FIRST_RENDER)
+    except CannotRenderError as error:
+        return {**row, "status": "cannot", "error": str(error)}
+    reference = reference_of(opened)
+    found = {k: v for k, v in figures_of(renders, reference).items() if k != "curve"}
+    return {**row, "status": "ok", **found, "reference": opened.reference_row}

@@ -1,0 +1,35 @@
+"""Measure accuracy against speed, stability and cost with the benchmarks of this checkout; see psdr bench --help."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+
+from psdr_jit import drjit_libraries, llvm
+from psdr_jit.cli.test import checkout
+
+NAME = "bench"
+HELP = "measure accuracy, speed and stability (needs a clone)"
+
+INTERRUPTED = 130
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """`main` hands over everything that follows `bench` unparsed."""
+    parser.add_argument("rest", nargs="*", metavar="ARG", help="passed on to the benchmarks")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Exit status of `python -m benchmarks.run`, which runs where the user stands."""
+    root = checkout("benchmarks", NAME)
+    llvm.ensure_llvm()
+    environment = {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
+    paths = [str(root), *filter(None, [environment.get("PYTHONPATH")])]
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    try:
+        command = [sys.executable, "-m", "benchmarks.run", *args.rest]
+        return subprocess.run(command, env=environment, check=False).returncode
+    except KeyboardInterrupt:
+        return INTERRUPTED
