@@ -33,6 +33,7 @@ PICTURED = ("area shadow", "cbox contact", "branching", "rough glass, spot moved
 PICTURED_METHODS = ("psdr_path", "prb_projective, small octree", "prb_projective, no guiding", "edge sampling",
                     "prb_reparam", "finite differences")  # fmt: skip
 PANEL_COLUMNS = 5
+PANEL_WIDTH, LEAST_WIDTH, LEGEND_HEIGHT = 2.1, 8.0, 0.6  # [in]
 GAIN_LIMITS = (-0.1, 2.1)  # of the axis; what lies outside is drawn at its edge
 RATIOS = (
     "best prb_projective / psdr_path\n"
@@ -58,7 +59,8 @@ def panels(count: int, height: float) -> tuple[Any, list[Any]]:
 
     lines = -(-count // PANEL_COLUMNS)
     columns = min(count, PANEL_COLUMNS)
-    figure, axes = plt.subplots(lines, columns, figsize=(2.1 * columns, height * lines), squeeze=False)
+    size = (max(PANEL_WIDTH * columns, LEAST_WIDTH), height * lines + LEGEND_HEIGHT)
+    figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False)
     flat = list(axes.ravel())
     for axis in flat[count:]:
         axis.set_visible(False)
@@ -78,6 +80,16 @@ def save(figure: Any, path: Path) -> Path:
 
 def legend(figure: Any, handles: dict[str, Any], columns: int) -> None:
     figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=columns, fontsize=7, frameon=False)
+
+
+def labelled(figure: Any, vertical: str, horizontal: str) -> None:
+    """Labels for all panels together, with room for a legend below."""
+    below = LEGEND_HEIGHT / figure.get_figheight()
+    if vertical:
+        figure.supylabel(vertical, fontsize=8, x=0.005)
+    if horizontal:
+        figure.supxlabel(horizontal, fontsize=8, y=0.75 * below)
+    figure.tight_layout(rect=(0.015, below, 1, 1), w_pad=0.4, h_pad=0.8)
 
 
 def draw(axis: Any, method: str, x: Sequence[float], y: Sequence[float]) -> Any:
@@ -101,9 +113,7 @@ def error_against_time(rows: list[dict[str, Any]], path: Path) -> Path:
         axis.set(xscale="log", yscale="log")
         axis.set_title(name, fontsize=7, color=INK, pad=3)
         axis.minorticks_off()
-    figure.supxlabel("seconds of rendering", fontsize=8, y=0.055)
-    figure.supylabel("relative RMSE of the derivative image", fontsize=8)
-    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    labelled(figure, "relative RMSE of the derivative image", "seconds of rendering; dotted: error of the reference")
     legend(figure, {k: handles[k] for k in STYLES if k in handles}, 5)
     return save(figure, path)
 
@@ -139,9 +149,10 @@ def derivative_images(folder: Path, path: Path) -> Path | None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    columns = 1 + len(PICTURED_METHODS)
-    figure, axes = plt.subplots(2 * len(chosen), columns, figsize=(1.25 * columns, 2.55 * len(chosen) + 0.7),
-                                squeeze=False)  # fmt: skip
+    columns = ("reference", *PICTURED_METHODS)
+    figure, axes = plt.subplots(2 * len(chosen), len(columns), figsize=(1.3 * len(columns), 2.7 * len(chosen) + 0.4),
+                                squeeze=False, layout="constrained")  # fmt: skip
+    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, hspace=0.02, wspace=0.01)
     for axis in axes.ravel():
         axis.set(xticks=[], yticks=[])
         axis.set_frame_on(False)
@@ -150,21 +161,23 @@ def derivative_images(folder: Path, path: Path) -> Path | None:
         stored = dict(np.load(accuracy.image_path(folder, case)))
         limit = np.percentile(np.abs(truth), 99.5) or np.abs(truth).max()
         look = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "interpolation": "nearest"}
-        shown = axes[2 * k, 0].imshow(truth, **look)
-        axes[2 * k, 0].set_ylabel(case.name, fontsize=7)
-        bar = figure.colorbar(shown, ax=axes[2 * k + 1, 0], location="left", fraction=0.12, pad=-0.6)
+        image, error = axes[2 * k], axes[2 * k + 1]
+        shown = image[0].imshow(truth, **look)
+        image[0].set_ylabel(case.name, fontsize=8)
+        error[0].set_aspect("equal")
+        error[1].set_ylabel("error", fontsize=7)
+        bar = figure.colorbar(shown, cax=error[0].inset_axes((0.55, 0.05, 0.08, 0.9)))
+        bar.ax.yaxis.set_ticks_position("left")
         bar.ax.tick_params(labelsize=5)
-        bar.set_label("d radiance / d unit", fontsize=5)
+        bar.ax.set_title("d radiance / d unit", fontsize=5, loc="right")
         for column, method in enumerate(PICTURED_METHODS, start=1):
             if method in stored:
-                axes[2 * k, column].imshow(stored[method], **look)
-                axes[2 * k + 1, column].imshow(stored[method] - truth, **look)
+                image[column].imshow(stored[method], **look)
+                error[column].imshow(stored[method] - truth, **look)
             else:
-                axes[2 * k, column].text(0.5, 0.5, "cannot", ha="center", fontsize=7, color=INK)
-        axes[2 * k + 1, 1].set_ylabel("error", fontsize=7)
-    for column, name in enumerate(("reference", *PICTURED_METHODS)):
-        axes[0, column].set_title(name.replace(", ", ",\n"), fontsize=6)
-    figure.tight_layout(pad=0.3)
+                image[column].text(0.5, 0.5, "cannot", ha="center", fontsize=7, color=INK)
+    for axis, name in zip(axes[0], columns, strict=True):
+        axis.set_title(name.replace(", ", ",\n"), fontsize=7)
     return save(figure, path)
 
 
@@ -186,8 +199,7 @@ def stability(rows: list[dict[str, Any]], path: Path) -> Path:
         axis.set_ylim(GAIN_LIMITS[0] - 0.05, GAIN_LIMITS[1] + 0.05)
         axis.set_xticks(range(len(steps)), [f"{value:g}" for value in steps], fontsize=5)
         axis.set_title(name, fontsize=7, color=INK, pad=3)
-    figure.supylabel("gain against finite differences", fontsize=8)
-    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    labelled(figure, "gain against finite differences", "grey: within 0.05; crosses below: the method cannot do it")
     legend(figure, handles, 3)
     return save(figure, path)
 
@@ -211,6 +223,6 @@ def costs(rows: list[dict[str, Any]], path: Path) -> Path:
             axis.set_title(name, fontsize=7, color=INK, pad=3)
     axes[0].set_ylabel("ms per call", fontsize=7)
     axes[len(names)].set_ylabel("peak memory [MiB]", fontsize=7)
-    figure.tight_layout(rect=(0.01, 0.06, 1, 1), w_pad=0.4, h_pad=0.8)
+    labelled(figure, "", "")
     legend(figure, handles, 5)
     return save(figure, path)

@@ -6,7 +6,7 @@ What a method cannot do it says by raising: the row then has the message instead
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -114,8 +114,7 @@ def mitsuba_integrator(plugin: str, spp: int = SPP, tuning: dict[str, Any] | Non
     return open_case
 
 
-@one_by_one
-def finite_differences(problem: Problem) -> Callable:
+def finite_differences(problem: Problem, budget: float, max_first: float) -> Renders:
     """Central differences of `path` with common random numbers; setting the scene is part of the time."""
     difference = CentralDifference(problem.motion, problem.case.limits)
 
@@ -123,7 +122,7 @@ def finite_differences(problem: Problem) -> Callable:
         (image,), seconds = timed(lambda: difference.differences([FD_METHOD_SEED + seed]))
         return image, seconds
 
-    return render
+    return replace(collect(render, budget, max_first), settings={"eps": difference.eps, "fd_spp": difference.spp})
 
 
 @one_by_one
@@ -162,7 +161,7 @@ METHODS = (
     Method("direct_projective, small octree", "other",
            mitsuba_integrator("direct_projective", tuning=projective.SMALL_OCTREE, guiding="octree"),
            settings=projective.SMALL_OCTREE),
-    Method("finite differences", "other", finite_differences),
+    Method("finite differences", "other", finite_differences, settings={"samples": "fd_spp on either side"}),
     Method("edge sampling", "other", edge_sampling),
     Method("prb_reparam", "other", prb_reparam),
 )  # fmt: skip

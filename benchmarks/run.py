@@ -182,7 +182,11 @@ def main(argv: list[str] | None = None) -> int:
     if len(pending) < len(wanted):
         kept = len(wanted) - len(pending)
         print(f"{kept} of {len(wanted)} rows exist in {args.out} and are kept (--redo: measure anew)")
-    lost = measure(pending, args)
+    try:
+        lost = measure(pending, args)
+    except KeyboardInterrupt:
+        print("psdr bench: interrupted; the same command continues with what is left", file=sys.stderr)
+        return INTERRUPTED
     elsewhere = "" if args.out == rows.RESULTS else f" --out {args.out}"
     print(f"rows are in {args.out}; charts and tables:  psdr bench --report{elsewhere}")
     return FAILED if lost else OK

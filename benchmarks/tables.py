@@ -70,12 +70,13 @@ def summary_words(lines: list[dict[str, Any]]) -> str:
     costs, errors = [line["cost_ratio"] for line in able], [line["mse_ratio"] for line in lines]
     if not able:
         return ""
+    median = sorted(errors)[len(errors) // 2]
     return (
         f"Against the best configuration of `prb_projective` in each case: {geometric_mean(costs):.3g} times less "
         f"variance x seconds in the geometric mean of the {len(able)} cases of which it finds between half and one and "
         f"a half of the derivative ({min(costs):.3g} at least; the others are in brackets), and "
         f"{geometric_mean(errors):.3g} times less squared error after an equal 10 s in the mean of all {len(lines)} "
-        f"cases ({min(errors):.3g} at least)."
+        f"cases (median {median:.3g}, {min(errors):.3g} at least)."
     )
 
 

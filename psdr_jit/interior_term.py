@@ -86,7 +86,9 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
     facts = job.facts
     # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
-    limits = replace(job.limits, end_black=not any(s.material for s in facts.shapes))
+    material = any(s.material for s in facts.shapes)
+    rough_glass = any(s.bsdf_flags & int(mi.BSDFFlags.GlossyTransmission) for s in facts.shapes)
+    limits = replace(job.limits, end_black=not material, refuses=material and rough_glass)
     if facts.geometry_moves:
         limits = replace(limits, uniform_share=UNIFORM_SHARE)
     if limits.max_depth == 0:

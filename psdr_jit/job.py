@@ -34,7 +34,8 @@ class Job:
 
     @property
     def limits(self) -> PathLimits:
-        return PathLimits(self.options.depth_limit, self.options.rr_depth)
+        own_frames = any(shape.sees_frame for shape in self.facts.shapes)
+        return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames)
 
 
 def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .records import EmitterSample, Hit, Vertex
-from .scattering import Scattering, mixture_pdf, sample_scattering
+from .scattering import accepted, mixture_pdf, sample_scattering
 
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
@@ -27,6 +27,8 @@ class PathLimits:
     rr_depth: int
     end_black: bool = True  # a throughput of 0 ends the path; not if its derivative is wanted
     uniform_share: float = 0.0  # of the directions, see `scattering`
+    refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
+    own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `interaction`
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
@@ -103,15 +105,32 @@ def first_hit(scene: mi.Scene, ray: mi.Ray3f, hide_emitters: bool):
     return ray, pi, mi.Bool(False)
 
 
-def _evaluate_and_sample(ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, sampler, share: float, active: mi.Bool):
+def interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, own_frames: bool) -> mi.SurfaceInteraction3f:
+    """The surface that `ray` meets. Unless `own_frames`, its shading frame depends on the normal alone.
+
+    Mitsuba takes the tangents of a mesh without texture coordinates from the first side of each triangle: with equal
+    random numbers, a path would go on in another direction from the next triangle of the same plane, and the difference
+    of radiance across their edge, which is nearly 0, would be noise.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    if own_frames:
+        return si
+    si.sh_frame = mi.Frame3f(si.sh_frame.n)
+    si.wi = dr.select(si.is_valid(), si.to_local(-ray.d), si.wi)
+    return si
+
+
+def _evaluate_and_sample(
+    ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, sampler, share: float, refuses: bool, active: mi.Bool
+):
     """The BSDF towards an emitter and a direction to go on: `(f cosθ, pdf, Scattering)`."""
     u_lobe, u = sampler.next_1d(), sampler.next_2d()
     if share == 0:  # in one virtual call
         f, pdf, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u, active)
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return f, pdf, Scattering(bs.wo, bs.pdf, weight, bs.eta, delta)
+        return f, pdf, accepted(ctx, si, bsdf, bs, weight, refuses, active)
     f, pdf = bsdf.eval_pdf(ctx, si, wo, active)
-    return f, mixture_pdf(si, bsdf, wo, pdf, share), sample_scattering(ctx, si, bsdf, u_lobe, u, share, active)
+    onward = sample_scattering(ctx, si, bsdf, u_lobe, u, share, refuses, active)
+    return f, mixture_pdf(si, bsdf, wo, pdf, share), onward
 
 
 @dr.syntax
@@ -133,7 +152,7 @@ def walk(
     """
     # a frozen dataclass cannot be loop state
     max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
-    share = limits.uniform_share
+    share, refuses, own_frames = limits.uniform_share, limits.refuses, limits.own_frames
     ctx = mi.BSDFContext()
 
     ray = mi.Ray3f(ray)
@@ -150,7 +169,7 @@ def walk(
     surface = pi.is_valid()
 
     while dr.hint(active, label="psdr.walk"):
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        si = interaction(pi, ray, own_frames)
 
         ds = mi.DirectionSample3f(scene, si=si, ref=prev)
         pdf_em = scene.pdf_emitter_direction(prev, ds, ~prev_delta)
@@ -164,7 +183,7 @@ def walk(
         active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, value_em = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
         hit_em, active_em = sink.connect(scene, si, ds, active_em & (ds.pdf > 0))
-        f_em, pdf_bsdf, bs = _evaluate_and_sample(ctx, si, bsdf, si.to_local(ds.d), sampler, share, alive)
+        f_em, pdf_bsdf, bs = _evaluate_and_sample(ctx, si, bsdf, si.to_local(ds.d), sampler, share, refuses, alive)
         mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_bsdf))
         L[active_em] += β * mis_em * f_em * value_em
 

@@ -43,13 +43,31 @@ def _share(bsdf: mi.BSDFPtr, share: float) -> mi.Float:
     return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta), 0, share)
 
 
+def _refused(weight: mi.Spectrum, f: mi.Spectrum) -> mi.Bool:
+    """Samples that a BSDF sent back with weight 0 though it is not 0 there.
+
+    A rough dielectric whose reflected direction ends on the wrong side does so, with the density of a sample that did
+    not happen; `f` and `pdf` at that direction are those of its other lobe.
+    """
+    return (dr.max(weight) == 0) & (dr.max(f) != 0)
+
+
+def accepted(ctx, si, bsdf: mi.BSDFPtr, bs, weight: mi.Spectrum, refuses: bool, active: mi.Bool) -> Scattering:
+    """The outcome of `bsdf.sample`. `refuses`: density 0 for `_refused` directions, where paths go on at weight 0."""
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    pdf = mi.Float(bs.pdf)
+    if refuses:
+        pdf = dr.select(~delta & _refused(weight, bsdf.eval(ctx, si, bs.wo, active & ~delta)), 0, pdf)
+    return Scattering(bs.wo, pdf, weight, bs.eta, delta)
+
+
 def sample_scattering(
-    ctx, si, bsdf: mi.BSDFPtr, u_lobe: mi.Float, u: mi.Point2f, share: float, active: mi.Bool
+    ctx, si, bsdf: mi.BSDFPtr, u_lobe: mi.Float, u: mi.Point2f, share: float, refuses: bool, active: mi.Bool
 ) -> Scattering:
     """Direction in which a path goes on: uniform with probability `share`, else sampled from the BSDF."""
     if share == 0:
         bs, weight = bsdf.sample(ctx, si, u_lobe, u, active)
-        return Scattering(bs.wo, bs.pdf, weight, bs.eta, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
+        return accepted(ctx, si, bsdf, bs, weight, refuses, active)
     q = _share(bsdf, share)
     uniform = u_lobe < q
     u_lobe = dr.select(uniform, u_lobe / q, (u_lobe - q) / (1 - q))
@@ -64,7 +82,7 @@ def sample_scattering(
 
     f, pdf_bsdf = bsdf.eval_pdf(ctx, si, wo, active & ~delta)
     pdf = mixture_pdf(si, bsdf, wo, pdf_bsdf, share)
-    found = (uniform | (bs.pdf > 0)) & (pdf > 0)
+    found = (uniform | ((bs.pdf > 0) & ~_refused(weight, f))) & (pdf > 0)
     weight = dr.select(delta, weight, dr.select(found, f / pdf, 0))
     η = dr.select(uniform, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette
     pdf = dr.select(delta, bs.pdf, dr.select(found, pdf, 0))

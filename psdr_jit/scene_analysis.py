@@ -23,6 +23,7 @@ from .scene_probes import (
     jumping_textures,
     non_finite_vertices,
     plugin_name,
+    sees_frame,
     weights_of_delta_lobes,
 )
 from .support import ANALYTIC_SHAPES, POSE_PARAMETERS, UNSUPPORTED_SHAPES, support_table
@@ -51,6 +52,7 @@ class ShapeFacts:
     delta_varies: bool  # such a parameter, enabled or not, varies over the surface
     blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
     jumps: tuple[str, ...]  # what is discontinuous inside the surface, "checkerboard 'floor'", ...
+    sees_frame: bool  # its BSDF depends on how the shading frame is turned about the normal
     geometry: tuple[str, ...]  # parameters that move the surface
     shading: tuple[str, ...]  # vertex normals, texture coordinates and attributes
     material: tuple[str, ...]  # of the BSDF and its textures
@@ -220,6 +222,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
         jumps=jumping_textures(graph, bsdf),
+        sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),
         material=graph.enabled_from(bsdf),

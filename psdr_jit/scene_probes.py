@@ -14,7 +14,7 @@ import numpy as np
 
 from .compat import mesh_positions
 from .params import parameter_value
-from .support import JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
+from .support import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
 
 HARD_EDGE = 1e-3
 """A spot whose rim is thinner than this fraction of its cone counts as a step: no sampling resolves it."""
@@ -202,6 +202,13 @@ def jumping_textures(graph: SceneGraph, owner: mi.Object | None) -> tuple[str, .
         if stepped or plugin in JUMPING_PLUGINS:
             found[f"{plugin} '{node.id()}'" if node.id() else plugin] = None
     return tuple(found)
+
+
+def sees_frame(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a BSDF depends on how the shading frame is turned about the normal: brushed metal, normal maps."""
+    known = [node for node in graph.walk(bsdf, skip=(mi.Shape,)) if isinstance(node, mi.BSDF)]
+    turned = any(node.flags() & int(mi.BSDFFlags.Anisotropic) for node in known)
+    return turned or any(plugin_name(node) not in FRAME_FREE_PLUGINS for node in known)
 
 
 def _is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:

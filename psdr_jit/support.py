@@ -55,6 +55,12 @@ SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
 """Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
 
+FRAME_FREE_PLUGINS = frozenset({
+    "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
+    "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",
+})  # fmt: skip
+"""Materials that do not see how the shading frame is turned about the normal, unless flagged as anisotropic."""
+
 SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance")})
 """(plugin, parameter) of materials with a delta lobe: those that only shape the smooth lobe beside it."""
 

@@ -134,6 +134,12 @@ PROBLEMS = (
     Problem("glossy_floor", "blocker.vertex_positions", 0.005, direction=X),
     Problem("baffled_light", "blocker.vertex_positions", 0.005, direction=X, slow=True),
     Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3}),
+    # leaves and boxes about a pixel wide: a larger step would take their corners across the borders of pixels
+    Problem("branching", "tree.vertex_positions", 0.001, rotate=Y, load={"res": 64}, slow=True),
+    Problem("many_occluders", "occluders.vertex_positions", 0.002, direction=X, slow=True),
+    # longer paths through rough glass are too noisy for this comparison
+    Problem("rough_glass", "ball.bsdf.eta", 0.015, load=DEPTH_3, slow=True),
+    Problem("rough_glass", "lamp.to_world", 0.004, direction=X, load=DEPTH_3, slow=True),
     # shapes that cut into each other
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=Y),
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=X, slow=True),

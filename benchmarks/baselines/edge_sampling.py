@@ -34,14 +34,14 @@ exterior angle, serves the whole scene. With edges by the thousand, theirs is be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from psdr_jit import film as films
 from psdr_jit.ad import tangents
-from psdr_jit.boundary.edge_points import LEAD, SIDE_OFFSET, EdgePoint, segment_position
+from psdr_jit.boundary.edge_points import EdgePoint, clearance, segment_position
 from psdr_jit.boundary.edge_sources import _open_side
 from psdr_jit.boundary.edges import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
 from psdr_jit.edge_distribution import EdgeDistribution, pmf, sample_edge
@@ -50,9 +50,8 @@ from psdr_jit.errors import UnsupportedError
 from psdr_jit.interior_term import _camera_passes
 from psdr_jit.job import Job
 from psdr_jit.low_discrepancy import pixel_sampler
-from psdr_jit.path_steps import SHADOW_EPSILON, NoSink, PathLimits, continue_path, first_hit, walk
+from psdr_jit.path_steps import SHADOW_EPSILON, NoSink, continue_path, first_hit, walk
 from psdr_jit.records import Hit
-from psdr_jit.scattering import sample_scattering
 from psdr_jit.scene_analysis import SceneFacts
 from psdr_jit.sensor_frame import View
 from psdr_jit.streams import Stream, stream_seed
@@ -231,7 +230,7 @@ def sample_view(job: Job, table: EdgeTable, dist: EdgeDistribution, path: Camera
     n, _, silhouette = _open_side(e, dx, ω)
     silhouette &= e.junction == 0  # where surfaces cut into each other, nothing passes
 
-    lead = LEAD * SIDE_OFFSET * (dr.max(dr.abs(x)) + dr.norm(dx))
+    _, lead = clearance(x, dr.norm(dx), table.centre, e.blur)
     active = (speed_of_t > 0) & (r > lead) & ((dr.dot(side, v - u) != 0) | sources_move(job.facts))
     bsdf = si.bsdf()
     f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
@@ -261,7 +260,7 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
     speed = dr.dot(v.side, v.v - v.u)
     value = dr.zeros(mi.Spectrum, dr.width(index))
     if segments > 1:
-        limits = PathLimits(segments, job.options.rr_depth)
+        limits = replace(job.limits, max_depth=segments)
         rng = pixel_sampler(seed, v.lane, spp)
         L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), mi.Bool(False), differs)
         value += L * speed
@@ -281,9 +280,9 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
 def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath:
     """To the next vertex, by BSDF sampling with roulette; paths that end are left out."""
     rng = pixel_sampler(seed, path.lane, spp)
-    bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), rng.next_1d(), rng.next_2d(), 0.0, mi.Bool(True))
+    bs, weight = si.bsdf().sample(mi.BSDFContext(), si, rng.next_1d(), rng.next_2d(), True)
     vertex = mi.UInt32(k - 1)
-    β, η, alive, _ = continue_path(rng, path.β * bs.weight, path.η * bs.η, vertex, job.options.rr_depth)
+    β, η, alive, _ = continue_path(rng, path.β * weight, path.η * bs.eta, vertex, job.options.rr_depth)
     ray = si.spawn_ray(si.to_world(bs.wo))
     alive &= bs.pdf > 0
     pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=alive)

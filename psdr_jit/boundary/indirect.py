@@ -15,7 +15,7 @@ The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +33,7 @@ from ..edge_rows import EdgeRows
 from ..job import Job
 from ..low_discrepancy import lane_sampler
 from ..path_records import RadianceByDepth
-from ..path_steps import PathLimits, walk
+from ..path_steps import walk
 from ..records import Hit
 from ..sensor_frame import SensorFrame, View
 from ..streams import Stream, stream_seed
@@ -192,7 +192,7 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     ray, pi, differs = sides(job.scene, table, v.row, v.t, point, v.scale, which, v.wavelengths)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), v.lane)
     by_depth = RadianceByDepth(2 * n, vertices)
-    limits = PathLimits(vertices, job.options.rr_depth)
+    limits = replace(job.limits, max_depth=vertices)
     final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, mi.Bool(False), differs)
     dr.eval(final, by_depth.values, by_depth.reached)
     return by_depth, final

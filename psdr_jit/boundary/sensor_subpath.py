@@ -221,7 +221,7 @@ def walk_to_sensor(
         seen &= ~scene.ray_test(shadow, seen)
         g_connect = deposit(a, si.n, view.ω)
 
-        bs = sample_scattering(ctx, si, bsdf, sampler.next_1d(), sampler.next_2d(), UNIFORM_SHARE, active)
+        bs = sample_scattering(ctx, si, bsdf, sampler.next_1d(), sampler.next_2d(), UNIFORM_SHARE, False, active)
         onward = si.to_world(bs.wo)
         weight = bs.weight * _adjoint_correction(si, onward)
         g_continue = deposit(a, si.n, -onward)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
+from functools import partial
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import assert_grad_close, fd, forward
 
+from benchmarks import cases, meshes, stability
+from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.perturbation import perturb
+from psdr_jit.statistics import gain
 
 X = (1, 0, 0)
 SEEDS = 8
@@ -137,3 +143,35 @@ def test_a_camera_that_leaves_a_room(llvm):
 
     first, _, again = image(0), image(1), image(0)
     assert np.array_equal(first, again) and first.any()
+
+
+def stretched(case, **budgets) -> np.ndarray:
+    """Derivative images of the edges alone, of a benchmark's case at low resolution."""
+    motion = cases.load(case, 16, rfilter="gaussian")
+    return forward(motion, {"type": "psdr_path", **case.limits, "sppc": 0, **budgets}, SEEDS, 64)
+
+
+def assert_alike(images: np.ndarray, others: np.ndarray, tolerance: float):
+    slope = gain(images, others[0::2], others[1::2])
+    assert abs(slope.value - 1) < tolerance + 3 * slope.stderr, slope
+    assert slope.stderr < 0.02, slope
+
+
+def test_slivers_do_not_stop_the_rays_that_pass_them(llvm):
+    """Rounding lets a ray hit a sliver of aspect ratio 1000 beside its edge; a ball of slivers is a ball."""
+    coarse, fine = (stretched(stability.of_mesh(partial(meshes.ball, 3, n))) for n in (64, 4096))
+    assert_alike(fine, coarse, 0.02)
+
+
+@pytest.mark.parametrize("shift, tolerance", [(100, 0.005), (1000, 0.03)])
+def test_place_in_space_does_not_matter(llvm, shift, tolerance):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the scene is only", UnsupportedWarning)
+        assert_alike(stretched(stability.placed(1, shift)), stretched(stability.placed(1, 0)), tolerance)
+
+
+def test_fine_creases_are_sampled_by_what_they_show(llvm):
+    """Flat faces of a ball are the less visible the more there are: few samples should go to each."""
+    balls = [stability.of_mesh(partial(meshes.round_ball, n)) for n in (1e4, 1e5)]
+    coarse, fine = (stretched(ball, sppd=0).var(0, ddof=1).mean() for ball in balls)
+    assert fine < 4 * coarse
