@@ -1,16 +1,16 @@
 """Baseline: unidirectional edge sampling, the secondary boundary found from a camera path.
 
 Before boundaries were sampled from the edge outwards, differentiable path tracers looked for them from where the path
-happened to be [Li et al. 2018, Differentiable Monte Carlo Ray Tracing through Edge Sampling, §4.2; Zhang et al. 2019,
-A Differential Theory of Radiative Transfer, §6]. `EdgeSampling` does that with our own edge table and our own interior
-and primary terms, so that it differs from `psdr_path` in nothing but where the secondary boundary is sampled.
+happened to be [Li et al. 2018, Differentiable Monte Carlo Ray Tracing through Edge Sampling; Zhang et al. 2019, A
+Differential Theory of Radiative Transfer]. `EdgeSampling` does that with our own edge table and our own interior and
+primary terms, so that it differs from `psdr_path` in nothing but where the secondary boundary is sampled.
 
 *Derivation.* A camera path x_1, x_2, … by BSDF sampling has throughput β_k at x_k, where
 
     L_o(x_k) = ∫ f(ω) cosθ L_i(x_k, ω) dω
 
-and L_i jumps across the image of every edge on the sphere of directions. Reynolds' theorem [Zhang et al. 2019, Eq. 4]
-leaves an integral over that image, a curve with element |τ×ω| dl / r_B whose points move with s·(v_B − u_k) / r_B
+and L_i jumps across the image of every edge on the sphere of directions. Reynolds' transport theorem [Zhang et al.
+2019] leaves an integral over that image, a curve with element |τ×ω| dl / r_B whose points move with s·(v_B − u_k) / r_B
 across themselves (s = τ×ω/|τ×ω|, ω from x_k to the edge point x_B, r_B their distance, v_B the edge's velocity, u_k
 that of x_k sliding along its ray, see `psdr_jit/interior.py`). With one edge point of density pdf_len per vertex,
 
