@@ -88,8 +88,8 @@ def labelled(figure: Any, vertical: str, horizontal: str) -> None:
     if vertical:
         figure.supylabel(vertical, fontsize=8, x=0.005)
     if horizontal:
-        figure.supxlabel(horizontal, fontsize=8, y=0.75 * below)
-    figure.tight_layout(rect=(0.015, below, 1, 1), w_pad=0.4, h_pad=0.8)
+        figure.supxlabel(horizontal, fontsize=8, y=0.7 * below)
+    figure.tight_layout(rect=(0.015, 0.6 * below, 1, 1), w_pad=0.4, h_pad=0.8)
 
 
 def draw(axis: Any, method: str, x: Sequence[float], y: Sequence[float]) -> Any:

@@ -27,7 +27,7 @@ NAME = "stability"
 RES = 32
 REFERENCE_BUDGETS = 4.0
 SLOWEST_FIRST_RENDER = 45.0  # [s]
-METHODS = ("psdr_path", "prb_projective, no guiding", "prb_projective, small octree")
+METHODS = ("psdr_path", "prb_projective, no guiding")
 
 
 @dataclass(frozen=True)
