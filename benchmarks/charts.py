@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import accuracy, cases, references
+from benchmarks import cost as cost_suite
+from benchmarks import stability as stability_suite
 
 DPI = 200
 INK, LIGHT = "0.15", "0.75"
@@ -184,6 +186,7 @@ def derivative_images(folder: Path, path: Path) -> Path | None:
 def stability(rows: list[dict[str, Any]], path: Path) -> Path:
     """Gain along each sweep; 1 is right. A cross at the lower edge: the method cannot do that step."""
     names = list(dict.fromkeys(row["sweep"] for row in rows if "sweep" in row))
+    units = {sweep.name: sweep.unit for sweep in stability_suite.SWEEPS}
     figure, axes = panels(len(names), 1.7)
     handles: dict[str, Any] = {}
     for axis, name in zip(axes, names, strict=True):
@@ -198,6 +201,7 @@ def stability(rows: list[dict[str, Any]], path: Path) -> Path:
             axis.plot(missing, [GAIN_LIMITS[0]] * len(missing), "x", color=STYLES[method][0], markersize=4)
         axis.set_ylim(GAIN_LIMITS[0] - 0.05, GAIN_LIMITS[1] + 0.05)
         axis.set_xticks(range(len(steps)), [f"{value:g}" for value in steps], fontsize=5)
+        axis.set_xlabel(units.get(name, ""), fontsize=6, labelpad=1)
         axis.set_title(name, fontsize=7, color=INK, pad=3)
     labelled(figure, "gain against finite differences", "grey: within 0.05; crosses below: the method cannot do it")
     legend(figure, handles, 3)
@@ -208,6 +212,7 @@ def costs(rows: list[dict[str, Any]], path: Path) -> Path:
     """Milliseconds (upper line of panels) and MiB (lower) of a call along each sweep."""
     done = [row for row in rows if row["status"] == "ok"]
     names = list(dict.fromkeys(row["sweep"] for row in done))
+    units = {sweep.name: sweep.unit for sweep in cost_suite.SWEEPS}
     figure, axes = panels(2 * len(names), 1.8)
     handles: dict[str, Any] = {}
     for k, name in enumerate(names):
@@ -221,6 +226,7 @@ def costs(rows: list[dict[str, Any]], path: Path) -> Path:
             axis.set(xscale="log", yscale="log")
             axis.minorticks_off()
             axis.set_title(name, fontsize=7, color=INK, pad=3)
+            axis.set_xlabel(units.get(name, ""), fontsize=6, labelpad=1)
     axes[0].set_ylabel("ms per call", fontsize=7)
     axes[len(names)].set_ylabel("peak memory [MiB]", fontsize=7)
     labelled(figure, "", "")

@@ -8,7 +8,7 @@ structure, is not timed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,10 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks import cases, meshes, methods, rows
+from benchmarks import cases, meshes, methods, rows, sweeps
 from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
 from benchmarks.measure import measured
 from benchmarks.suites import Settings
+from benchmarks.sweeps import Sweep
 from psdr_jit.perturbation import Perturbation
 
 NAME = "cost"
@@ -38,14 +39,6 @@ class Step:
     res: int = RES
     spp: int = SPP
     texels: int = 0  # along one side of the texture that is differentiated; 0: no texture
-
-
-@dataclass(frozen=True)
-class Sweep:
-    name: str
-    unit: str
-    values: Sequence[float]
-    step: Callable[[float], Step]
 
 
 CORNELL = Case("", "cbox", SMALL_BOX, DEPTH, X)
@@ -69,7 +62,7 @@ SWEEPS = (
     Sweep("edges", "edges of the moving mesh", (1e2, 1e3, 1e4, 1e5, 1e6), of_ball),
     Sweep("parameters", "texture values that are differentiated", (12, 3e2, 3e4, 1e6), of_texture),
 )
-QUICK = ("samples",)
+QUICK, QUICK_STRIDE = ("samples",), 2
 
 
 @dataclass
@@ -81,20 +74,16 @@ class Opened:
     settings: Settings
 
 
-def case_name(sweep: Sweep, value: float) -> str:
-    return f"{sweep.name} {value:g}"
-
-
 def case_names() -> list[str]:
-    return [case_name(sweep, value) for sweep in SWEEPS for value in sweep.values]
+    return sweeps.case_names(SWEEPS)
 
 
 def quick_case_names() -> list[str]:
-    return [case_name(sweep, value) for sweep in SWEEPS if sweep.name in QUICK for value in sweep.values[:3]]
+    return sweeps.quick_case_names(SWEEPS, QUICK, QUICK_STRIDE)
 
 
 def open_case(name: str, settings: Settings) -> Opened:
-    sweep, value = next((s, v) for s in SWEEPS for v in s.values if case_name(s, v) == name)
+    sweep, value = sweeps.find(SWEEPS, name)
     step = sweep.step(value)
     motion = cases.load(step.case, step.res)
     if step.texels:
@@ -164,7 +153,7 @@ def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     make, spec = METHODS[method_name]
     step, case = opened.step, opened.step.case
     row = {
-        "bench": NAME, "case": case_name(opened.sweep, opened.value), "method": method_name,
+        "bench": NAME, "case": sweeps.case_name(opened.sweep, opened.value), "method": method_name,
         "sweep": opened.sweep.name, "value": opened.value,
         "settings": {"res": step.res, "spp": step.spp, **case.limits, "scene": case.scene, "parameter": case.param,
                      "budget": opened.settings.budget},

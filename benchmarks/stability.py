@@ -9,18 +9,19 @@ function of where an edge is, so that a difference over a tenth of a pixel is a 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks import cases, figures, meshes, methods
+from benchmarks import cases, figures, meshes, methods, sweeps
 from benchmarks.accuracy import LOAD, figures_of
 from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
 from benchmarks.measure import CannotRenderError
 from benchmarks.suites import Settings
+from benchmarks.sweeps import Sweep
 from psdr_jit.finite_differences import CentralDifference
 
 NAME = "stability"
@@ -28,17 +29,6 @@ RES = 32
 REFERENCE_BUDGETS = 4.0
 SLOWEST_FIRST_RENDER = 45.0  # [s]
 METHODS = ("psdr_path", "prb_projective, no guiding")
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """`step(value)` is the case at that value; `unit` is for the table's head."""
-
-    name: str
-    unit: str
-    values: Sequence[float]
-    step: Callable[[float], Case]
-    one_truth: Case | None = None  # every step has the derivative of this case
 
 
 def shadow(**load: Any) -> Case:
@@ -110,17 +100,12 @@ class Opened:
     reference_row: dict[str, Any] | None = None
 
 
-def case_name(sweep: Sweep, value: float) -> str:
-    return f"{sweep.name} {value:g}"
-
-
 def case_names() -> list[str]:
-    return [case_name(sweep, value) for sweep in SWEEPS for value in sweep.values]
+    return sweeps.case_names(SWEEPS)
 
 
 def quick_case_names() -> list[str]:
-    chosen = [sweep for sweep in SWEEPS if sweep.name in QUICK]
-    return [case_name(sweep, value) for sweep in chosen for value in sweep.values[::QUICK_STRIDE]]
+    return sweeps.quick_case_names(SWEEPS, QUICK, QUICK_STRIDE)
 
 
 def method_names(case: str) -> list[str]:
@@ -128,7 +113,7 @@ def method_names(case: str) -> list[str]:
 
 
 def open_case(name: str, settings: Settings) -> Opened:
-    sweep, value = next((s, v) for s in SWEEPS for v in s.values if case_name(s, v) == name)
+    sweep, value = sweeps.find(SWEEPS, name)
     step = replace(sweep.step(value), name=name)
     return Opened(sweep, value, methods.Problem(step, cases.load(step, RES, **LOAD), {"res": RES, **LOAD}), settings)
 
