@@ -21,6 +21,7 @@ from benchmarks.suites import REFERENCE, SUITES, suite
 from benchmarks.worker import DONE, START
 from psdr_jit import scene_io
 from psdr_jit.cli import _common
+from psdr_jit.errors import PsdrError
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 BUDGET, QUICK_BUDGET = 5.0, 3.0  # [s]
@@ -163,8 +164,14 @@ class Watchdog:
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     args.out = (args.out or (QUICK_FOLDER if args.quick else rows.RESULTS)).resolve()
-    args.budget = args.budget or (QUICK_BUDGET if args.quick else BUDGET)
-    _common.require_positive(budget=args.budget)
+    if args.budget is None:
+        args.budget = QUICK_BUDGET if args.quick else BUDGET
+    try:
+        _common.require_positive(budget=args.budget)
+        args.out.mkdir(parents=True, exist_ok=True)
+    except (PsdrError, OSError) as error:
+        print(f"psdr bench: error: {error}", file=sys.stderr)
+        return USAGE
     if args.report:
         from benchmarks import report
 

@@ -26,6 +26,12 @@ def test_no_such_case_is_an_error(capsys):
     assert "--list" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["--budget", "0"], ["--budget", "-1"], ["--out", __file__]])
+def test_bad_options_are_errors_without_a_traceback(words, capsys):
+    assert run.main(["--list", *words]) == run.USAGE
+    assert "psdr bench: error" in capsys.readouterr().err
+
+
 def test_nothing_to_report_is_an_error(tmp_path, capsys):
     assert run.main(["--report", "--out", str(tmp_path)]) == run.USAGE
     assert "no rows" in capsys.readouterr().err
