@@ -78,7 +78,7 @@ CASES = (
     Case("textured mover", "textured_emitter", "card.vertex_positions", 2, X),
     Case("material only", "cbox", "white.reflectance.value", 4, load=CONTACT),
 )
-QUICK = ("area shadow", "moving light", "cbox contact", "material only")
+QUICK = ("area shadow", "point shadow", "cbox contact", "material only")
 
 
 def load(case: Case, res: int, **overrides: Any) -> Perturbation:
