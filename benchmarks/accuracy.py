@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import cases, figures, methods, references, rows
-from benchmarks.measure import CannotRenderError, Renders
+from benchmarks.measure import Renders
 from benchmarks.suites import REFERENCE, Settings
 from psdr_jit.statistics import GroupedImages, gain
 
@@ -57,19 +57,13 @@ def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     problem, settings = opened.problem, opened.settings
     if method_name == REFERENCE:
         return {**references.make(settings.folder, problem, REFERENCE_BUDGETS * settings.budget), "method": REFERENCE}
-    method = next(method for method in methods.METHODS if method.name == method_name)
-    case = problem.case
-    row = {
-        "bench": NAME, "case": case.name, "method": method.name, "family": method.family,
-        "settings": {**problem.load, **case.limits, **case.load, **method.settings, "spp": method.spp,
-                     "parameter": case.param, "motion": problem.motion.label, "budget": settings.budget},
-    }  # fmt: skip
-    try:
-        renders = methods.measure(method, problem, settings.budget, SLOWEST_FIRST_RENDER)
-    except CannotRenderError as error:
-        return {**row, "status": "cannot", "error": str(error)}
-    store_image(settings.folder, case, method, renders)
-    return {**row, "status": "ok", **figures_of(renders, references.read(settings.folder, case))}
+    method = methods.named(method_name)
+    row, renders = methods.attempt(method, problem, settings.budget, SLOWEST_FIRST_RENDER)
+    row = {"bench": NAME, **row}
+    if renders is None:
+        return row
+    store_image(settings.folder, problem.case, method, renders)
+    return {**row, **figures_of(renders, references.read(settings.folder, problem.case))}
 
 
 def figures_of(renders: Renders, reference: figures.Reference) -> dict[str, Any]:

@@ -69,6 +69,10 @@ def collect(render: Callable[[int], tuple[np.ndarray, float]], budget: float, ma
         image, took = render(FIRST_SEED + 2 + len(images))
         images.append(image)
         seconds.append(took)
-    stack = np.stack(images)
-    bad = ~np.isfinite(stack)
-    return Renders(np.where(bad, 0.0, stack), np.array(seconds), first, int(bad.sum()))
+    return finite(np.stack(images), np.array(seconds), first)
+
+
+def finite(images: np.ndarray, seconds: np.ndarray, warm_up_seconds: float) -> Renders:
+    """Renders whose non-finite values are counted and replaced by 0."""
+    bad = ~np.isfinite(images)
+    return Renders(np.where(bad, 0.0, images), seconds, warm_up_seconds, int(bad.sum()))

@@ -21,6 +21,7 @@ from benchmarks.measure import (
     CannotRenderError,
     Renders,
     collect,
+    finite,
     timed,
 )
 from psdr_jit import integrators, scene_io
@@ -44,10 +45,6 @@ class Problem:
     motion: Perturbation
     load: dict[str, Any]  # overrides of the scene file's defaults, `res` included
 
-    @property
-    def how(self) -> dict[str, Any]:
-        return {"direction": self.case.direction, "rotate": self.case.rotate, "index": self.case.index}
-
 
 @dataclass(frozen=True)
 class Method:
@@ -65,12 +62,23 @@ def one_by_one(open_case: Callable[[Problem], Callable[[int], tuple[np.ndarray, 
     return lambda problem, budget, max_first: collect(open_case(problem), budget, max_first)
 
 
-def measure(method: Method, problem: Problem, budget: float, max_first: float) -> Renders:
-    """Renders of `method` for `budget` seconds. `CannotRenderError` names what it cannot do."""
+def named(name: str) -> Method:
+    return next(method for method in METHODS if method.name == name)
+
+
+def attempt(method: Method, problem: Problem, budget: float, max_first: float) -> tuple[dict[str, Any], Renders | None]:
+    """The beginning of a row, and renders for `budget` seconds; None, and the reason in the row, if it cannot."""
+    case = problem.case
+    row = {
+        "case": case.name, "method": method.name, "family": method.family,
+        "settings": {**problem.load, **case.limits, **case.load, **method.settings, "spp": method.spp,
+                     "parameter": case.param, "motion": problem.motion.label, "budget": budget},
+    }  # fmt: skip
     try:
-        return method.collect(problem, budget, max_first)
+        renders = method.collect(problem, budget, max_first)
     except OWN_FAILURES if method.family == "ours" else FAILURES as error:
-        raise CannotRenderError(last_line(error)) from error
+        return {**row, "status": "cannot", "error": last_line(error)}, None
+    return {**row, "status": "ok"}, renders
 
 
 def last_line(error: BaseException) -> str:
@@ -95,7 +103,7 @@ def renders_of(integrator: Any, motion: Perturbation, spp: int) -> Callable[[int
     return render
 
 
-def mitsuba_integrator(plugin: str, spp: int = SPP, tuning: dict[str, Any] | None = None, **options: Any) -> Callable:
+def mitsuba_integrator(plugin: str, tuning: dict[str, Any] | None = None, **options: Any) -> Callable:
     """Any integrator by plugin name. A flat mesh with seams is welded for the projective ones: they take seams for
     borders."""
 
@@ -108,8 +116,8 @@ def mitsuba_integrator(plugin: str, spp: int = SPP, tuning: dict[str, Any] | Non
             spec = {k: v for k, v in spec.items() if k not in ("max_depth", "rr_depth")}
         motion = problem.motion
         if "projective" in plugin and projective.has_seams(motion):
-            motion = projective.welded(motion, problem.how)
-        return renders_of(projective.integrator(spec, tuning or {}), motion, spp)
+            motion = projective.welded(motion, problem.case)
+        return renders_of(projective.integrator(spec, tuning or {}), motion, SPP)
 
     return open_case
 
@@ -143,10 +151,8 @@ def prb_reparam(problem: Problem, budget: float, max_first: float) -> Renders:
         timeout_seconds=max_first + RENDERS_OF_PATIENCE * budget,
     )  # fmt: skip
     found = reparam.render(request)
-    images = found.images.astype(np.float64)
-    bad = ~np.isfinite(images)
-    versions = {"versions_of_method": found.versions}
-    return Renders(np.where(bad, 0.0, images), found.seconds, found.warm_up_seconds, int(bad.sum()), versions)
+    renders = finite(found.images.astype(np.float64), found.seconds, found.warm_up_seconds)
+    return replace(renders, settings={"versions_of_method": found.versions})
 
 
 OURS = Method("psdr_path", "ours", mitsuba_integrator("psdr_path"))

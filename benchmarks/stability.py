@@ -19,7 +19,6 @@ import numpy as np
 from benchmarks import cases, figures, meshes, methods, sweeps
 from benchmarks.accuracy import LOAD, figures_of
 from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
-from benchmarks.measure import CannotRenderError
 from benchmarks.suites import Settings
 from benchmarks.sweeps import Sweep
 from psdr_jit.finite_differences import CentralDifference
@@ -47,10 +46,14 @@ ORIGIN, TARGET = np.array([0.7, 2.2, 4.0]), np.array([0.0, -0.5, 0.0])
 FLOOR, DISTANCE = -1.0, 4.0  # height of the floor; of the camera from the target
 
 
+def written(**points: np.ndarray) -> dict[str, str]:
+    """Points as a scene file has them."""
+    return {name: ", ".join(f"{x:.9g}" for x in point) for name, point in points.items()}
+
+
 def placed(size: float, shift: float) -> Case:
     """The whole scene, camera included, scaled and then moved along x; the motion is scaled as well."""
-    points = {"origin": ORIGIN * size + [shift, 0, 0], "target": TARGET * size + [shift, 0, 0]}
-    text = {name: ", ".join(f"{x:.9g}" for x in point) for name, point in points.items()}
+    text = written(origin=ORIGIN * size + [shift, 0, 0], target=TARGET * size + [shift, 0, 0])
     lengths = {"size": size, "shift": shift, "near": 0.01 * size, "far": 1e4 * size}
     return replace(shadow(**text, **lengths), direction=(size, 0, 0))
 
@@ -60,8 +63,7 @@ def seen_from(degrees: float) -> Case:
     angle = np.deg2rad(degrees)
     target = np.array([0.0, FLOOR, 0.0])
     origin = target + DISTANCE * np.array([0.0, np.sin(angle), np.cos(angle)])
-    text = {name: ", ".join(f"{x:.9g}" for x in point) for name, point in (("origin", origin), ("target", target))}
-    return shadow(**text)
+    return shadow(**written(origin=origin, target=target))
 
 
 def lit_from(degrees: float) -> Case:
@@ -137,18 +139,12 @@ def reference_of(opened: Opened) -> figures.Reference:
 
 def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     """The row of one method at one step, without circumstances."""
-    method = next(method for method in methods.METHODS if method.name == method_name)
-    problem, case = opened.problem, opened.problem.case
-    row = {
-        "bench": NAME, "case": case.name, "method": method.name, "family": method.family, "sweep": opened.sweep.name,
-        "value": opened.value,
-        "settings": {**problem.load, **case.limits, **case.load, **method.settings, "spp": method.spp,
-                     "parameter": case.param, "motion": problem.motion.label, "budget": opened.settings.budget},
-    }  # fmt: skip
-    try:
-        renders = methods.measure(method, problem, opened.settings.budget, SLOWEST_FIRST_RENDER)
-    except CannotRenderError as error:
-        return {**row, "status": "cannot", "error": str(error)}
+    row, renders = methods.attempt(
+        methods.named(method_name), opened.problem, opened.settings.budget, SLOWEST_FIRST_RENDER
+    )
+    row = {"bench": NAME, "sweep": opened.sweep.name, "value": opened.value, **row}
+    if renders is None:
+        return row
     reference = reference_of(opened)
     found = {k: v for k, v in figures_of(renders, reference).items() if k != "curve"}
-    return {**row, "status": "ok", **found, "reference": opened.reference_row}
+    return {**row, **found, "reference": opened.reference_row}

@@ -8,12 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks import meshes
-from psdr_jit.perturbation import Perturbation, perturb
+from benchmarks import cases, meshes
+from benchmarks.cases import Case
+from psdr_jit.mesh_edges import weld_vertices
+from psdr_jit.perturbation import Perturbation
 
 #: A guide that costs less to build: `prb_projective` reads these from its attributes, not from XML.
 SMALL_OCTREE = {"proj_seed_spp": 16, "octree_extra_leaf_sample": 8, "octree_max_depth": 6}
-WELD_DIGITS = 6  # decimals, relative to the size of the mesh, to which equal positions agree
 
 
 def integrator(spec: dict[str, Any], tuning: dict[str, Any]) -> Any:
@@ -34,10 +35,10 @@ def has_seams(motion: Perturbation) -> bool:
     return not textured and len(_weld(shape)[0]) < shape.vertex_count()
 
 
-def welded(motion: Perturbation, how: dict[str, Any]) -> Perturbation:
-    """The same scene with the mesh that moves welded by position, and the same motion of it."""
+def welded(motion: Perturbation, case: Case) -> Perturbation:
+    """The case's scene with the mesh that moves welded by position, and the same motion of it."""
     moving = motion.params.properties[motion.name][2]
-    return perturb(meshes.replaced(motion.scene, moving.id(), *_weld(moving)), motion.name, **how)
+    return cases.perturbed(meshes.replaced(motion.scene, moving.id(), *_weld(moving)), case)
 
 
 def _weld(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -45,6 +46,5 @@ def _weld(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     params = mi.traverse(mesh)
     points = np.array(dr.detach(params["vertex_positions"])).reshape(-1, 3)
     faces = np.array(params["faces"]).reshape(-1, 3)
-    grid = np.round((points - points.min(0)) / np.ptp(points), WELD_DIGITS)
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    return points[first], inverse.ravel()[faces]
+    kept, inverse = np.unique(weld_vertices(points), return_inverse=True)
+    return points[kept], inverse.ravel()[faces]

@@ -7,8 +7,8 @@ import os
 import subprocess
 import sys
 
-from psdr_jit import drjit_libraries, llvm
-from psdr_jit.cli.test import checkout
+from psdr_jit import llvm
+from psdr_jit.cli.test import checkout, environment
 
 NAME = "bench"
 HELP = "measure accuracy, speed and stability (needs a clone)"
@@ -25,11 +25,10 @@ def run(args: argparse.Namespace) -> int:
     """Exit status of `python -m benchmarks.run`, which runs where the user stands."""
     root = checkout("benchmarks", NAME)
     llvm.ensure_llvm()
-    environment = {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
-    paths = [str(root), *filter(None, [environment.get("PYTHONPATH")])]
-    environment["PYTHONPATH"] = os.pathsep.join(paths)
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    child = {**environment(), "PYTHONPATH": os.pathsep.join(paths)}
     try:
         command = [sys.executable, "-m", "benchmarks.run", *args.rest]
-        return subprocess.run(command, env=environment, check=False).returncode
+        return subprocess.run(command, env=child, check=False).returncode
     except KeyboardInterrupt:
         return INTERRUPTED

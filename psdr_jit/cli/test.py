@@ -34,6 +34,11 @@ def checkout(folder: str, command: str) -> Path:
     return root
 
 
+def environment() -> dict[str, str]:
+    """Of a child process, which loads the plugins even if this one was told not to."""
+    return {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
+
+
 def run(args: argparse.Namespace) -> int:
     """pytest's verdict as one of ours; a crash or an error while collecting is a failed check."""
     root = checkout("tests", NAME)
@@ -41,9 +46,8 @@ def run(args: argparse.Namespace) -> int:
         raise SetupError(f"pytest is not installed; run:  {sys.executable} -m pip install -e '{root}[test]'")
     llvm.ensure_llvm()
     given = [absolute(word, root) for word in args.rest]
-    environment = {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
     command = [sys.executable, "-m", "pytest", *given]
-    status = subprocess.run(command, cwd=root, env=environment, check=False).returncode
+    status = subprocess.run(command, cwd=root, env=environment(), check=False).returncode
     return EXIT_STATUS.get(status, 1)
 
 
