@@ -24,7 +24,7 @@ from psdr_jit.cli import _common
 from psdr_jit.errors import PsdrError
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-BUDGET, QUICK_BUDGET = 5.0, 3.0  # [s]
+BUDGET, QUICK_BUDGET = 5.0, 2.0  # [s]
 QUICK_FOLDER = Path("out") / "bench-quick"
 PATIENCE = 240.0  # [s] without a word from a worker, beside what the budget explains
 BUDGETS_OF_PATIENCE = 8.0

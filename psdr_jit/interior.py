@@ -49,13 +49,15 @@ class SceneTraits:
 
     delta_emitters: bool
     delta_lobes: bool  # only together with static geometry, see `scene_checks`
+    moves: bool  # geometry, a light's pose or the camera depend on θ; otherwise the paths themselves are constants
+    form: str = "spatial"  # what vertices do from the second on: slide along their rays, or stay on their material
 
 
-def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, active: mi.Bool):
-    """Emission of the material point `hit` towards the attached point `x`: `(ω, value)`, both attached.
+def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, active: mi.Bool):
+    """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
-    `value` = L_e · [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
-    emitter is infinitely distant and its direction stays as it is.
+    `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
+    direction stays as it is.
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
     si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
@@ -66,8 +68,13 @@ def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPt
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
     area = _area_element(si, on_surface)
     measure = dr.abs_dot(si.n, ω) / dist2 * area
-    value = emitter.eval(si, active) * dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
-    return ω, value
+    return si, ω, dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
+
+
+def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, active: mi.Bool):
+    """Emission of the material point `hit` towards the attached point `x`: `(ω, L_e · measure)`, both attached."""
+    si, ω, measure = _material_segment(x, hit, wavelengths, active)
+    return ω, emitter.eval(si, active) * measure
 
 
 def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
@@ -98,8 +105,75 @@ def _next_event(si, bsdf, nee, traits: SceneTraits):
     return dr.select(active, f * value * nee.weight, 0)
 
 
+def _terms_of_resting(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, traits: SceneTraits):
+    """`vertex_terms` where no path changes: what is emitted and reflected depends on θ, directions and measures do not.
+
+    Emission then counts where it is met, as in a primal path tracer.
+    """
+    ctx = mi.BSDFContext()
+    si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
+    bsdf = si.bsdf()
+    emits = vertex.weight_emission > 0
+    L = dr.select(emits, vertex.weight_emission * si.emitter(scene).eval(si, emits), 0)
+
+    nee, active = vertex.nee, vertex.nee.emitter != 0
+    emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
+    source_ray = mi.Ray3f(si.p, nee.d, 0, ray.wavelengths)
+    source = nee.hit(si.p).intersection().compute_surface_interaction(source_ray, mi.RayFlags.All, active)
+    value = emitter.eval(source, active)
+    if traits.delta_emitters:
+        is_delta = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+        _, value_delta = emitter.sample_direction(si, mi.Point2f(0.5), is_delta)
+        value = dr.select(is_delta, value_delta, value)
+    L += dr.select(active, bsdf.eval(ctx, si, si.to_local(nee.d), active) * value * nee.weight, 0)
+
+    goes_on = vertex.inv_pdf != 0
+    w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * dr.abs(vertex.inv_pdf)
+    if traits.delta_lobes:
+        w = dr.select(vertex.inv_pdf < 0, _throughput_ratio(vertex, following), w)
+    return VertexTerms(si.p, L, w)
+
+
+def _terms_on_material(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits):
+    """`vertex_terms` in material form: every vertex but the first stays where it is on its surface.
+
+    `ray` starts at the attached predecessor. Seen from there the vertex is met by a ray that moves along with it, so
+    that Mitsuba's own intersection yields the attached frame and texture coordinates of the same material point.
+    """
+    ctx = mi.BSDFContext()
+    pi = vertex.hit.intersection()
+    resting = mi.Ray3f(vertex.hit.o, vertex.hit.d, 0, ray.wavelengths)
+    material = pi.compute_surface_interaction(resting, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, pi.is_valid()).p
+    along = mi.Ray3f(ray)
+    along.o = dr.select(first, ray.o, dr.replace_grad(vertex.hit.o, material))
+    along.d = dr.select(first, ray.d, vertex.hit.d)
+    si = pi.compute_surface_interaction(along, mi.RayFlags.All)
+    arrival = dr.replace_grad(vertex.hit.d, dr.normalize(si.p - ray.o))
+    si.wi = dr.select(first | ~si.is_valid(), si.wi, si.to_local(-arrival))
+    L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
+    bsdf = si.bsdf()
+    L += _next_event(si, bsdf, vertex.nee, traits)
+
+    goes_on = vertex.inv_pdf != 0
+    onward, ω, measure = _material_segment(si.p, following.hit, si.wavelengths, goes_on)
+    w = bsdf.eval(ctx, si, si.to_local(ω), goes_on) * measure * dr.abs(vertex.inv_pdf)
+    emitter = dr.select(onward.is_valid(), onward.shape.emitter(), scene.environment())
+    emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
+    L += dr.select(emits, w * emitter.eval(onward, emits) * following.weight_emission, 0)
+    return VertexTerms(si.p, L, w)
+
+
+def _throughput_ratio(vertex: Vertex, following: Arrival) -> mi.Spectrum:
+    """Weight of a delta lobe, which has no value to evaluate: a constant here."""
+    return dr.select(vertex.β != 0, following.β / vertex.β, 0)
+
+
 def vertex_terms(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits):
     """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
+    if not traits.moves:
+        return _terms_of_resting(scene, vertex, following, ray, traits)
+    if traits.form == "material":
+        return _terms_on_material(scene, vertex, following, ray, first, traits)
     ctx = mi.BSDFContext()
     si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
@@ -117,9 +191,7 @@ def vertex_terms(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ra
     ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, emits)
     w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
     if traits.delta_lobes:
-        # A delta lobe has no value to evaluate. Its weight is the ratio of throughputs, a constant here.
-        is_delta = vertex.inv_pdf < 0
-        ratio = dr.select(vertex.β != 0, following.β / vertex.β, 0)
+        is_delta, ratio = vertex.inv_pdf < 0, _throughput_ratio(vertex, following)
         w, w_emission = dr.select(is_delta, ratio, w), dr.select(is_delta, ratio, w_emission)
     L += dr.select(emits, w_emission * value * following.weight_emission, 0)
     return VertexTerms(si.p, L, w)

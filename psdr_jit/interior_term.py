@@ -119,8 +119,10 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     return records, lane
 
 
-def _traits(facts: SceneFacts) -> SceneTraits:
-    return SceneTraits(facts.has_delta_emitters, any(s.delta_lobes for s in facts.shapes))
+def _traits(job: Job) -> SceneTraits:
+    facts = job.facts
+    delta_lobes = any(s.delta_lobes for s in facts.shapes)
+    return SceneTraits(facts.has_delta_emitters, delta_lobes, facts.geometry_moves, job.options.form)
 
 
 def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
@@ -144,7 +146,7 @@ def forward(job: Job) -> mi.TensorXf:
                     with dr.resume_grad():
                         o_grad, d_grad = tangents(p.ray.o, p.ray.d)
                     o_grad = o_grad + _skipped(job, p, records) * d_grad
-                recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job.facts))
+                recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job))
                 recorded = job.rejected.keep_finite(recorded)
                 dr.scatter(dL, recorded, lane)
                 dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
@@ -161,7 +163,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 continue
             δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
             δL = dr.gather(mi.Spectrum, δL, lane)
-            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job.facts))
+            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job))
             if job.facts.camera_moves:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():

@@ -10,6 +10,9 @@ from .errors import OptionError
 #: `max_depth = -1` in a scene file: unlimited. Mitsuba's own encoding.
 UNLIMITED = 0xFFFFFFFF
 
+#: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points.
+FORMS = ("spatial", "material")
+
 
 @dataclass(frozen=True)
 class Options:
@@ -27,6 +30,7 @@ class Options:
     sppi: int | None = None  # samples per pixel, default of each secondary boundary term
     sppd: int | None = None  # samples per pixel, direct boundary term; overrides sppi
     record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes
+    form: str = "spatial"  # one of FORMS
 
     def __post_init__(self):
         for field in fields(self):
@@ -41,6 +45,8 @@ class Options:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
+        if self.form not in FORMS:
+            raise OptionError(f"form = {self.form!r}: use {' or '.join(FORMS)}")
         if self.record_mib < 16:
             raise OptionError(f"record_mib = {self.record_mib}: at least 16 MiB are needed")
 
@@ -52,6 +58,12 @@ class Options:
                 raise OptionError(
                     f"{name} = {value!r} is of type {type(value).__name__}: use true or false "
                     f'(<boolean name="{name}" .../> in a scene file)'
+                )
+        elif isinstance(default, str):
+            if not isinstance(value, str):
+                raise OptionError(
+                    f"{name} = {value!r} is of type {type(value).__name__}: use a word "
+                    f'(<string name="{name}" .../> in a scene file)'
                 )
         elif value is not None or default is not None:
             require_count(name, value, f' (<integer name="{name}" .../> in a scene file)')

@@ -100,6 +100,14 @@ def silhouette_wedges(e: EdgeRows) -> Wedges:
     return Wedges(w.start, w.α, w.first, around, w.second, around)
 
 
+def background_wedges(e: EdgeRows) -> Wedges:
+    """Where something behind edge rows `e` appears or disappears: silhouettes, and curves at which surfaces meet."""
+    w, s = wedges(e), silhouette_wedges(e)
+    meets = e.junction > 0
+    front, second, back = (dr.select(meets, getattr(w, k), getattr(s, k)) for k in ("front", "second", "back"))
+    return Wedges(w.start, w.α, w.first, front, second, back)
+
+
 def sample_direction(e: EdgeRows, w: Wedges, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
     """Direction ω from the viewer's side through the edge, and its density per solid angle: `(ω, pdf_sa)`."""
     lengths = [w.α, dr.pi - w.α, w.α, dr.pi - w.α]
@@ -166,17 +174,26 @@ def towards_sphere(x: mi.Point3f, centre: mi.Point3f, radius: mi.Float) -> Cone:
     return Cone(axis, dr.select(outside, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2))
 
 
-def sample_view(e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """As `sample_direction`, with the mixture for edges that rest: `(ω, pdf_sa)`."""
+def sample_view(
+    e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, ahead: float, u: mi.Point2f
+) -> tuple[mi.Vector3f, mi.Float]:
+    """As `sample_direction`, with the mixture for edges that rest: `(ω, pdf_sa)`.
+
+    `ahead`: share of the cone's directions in which what moves is seen past the edge; otherwise the viewer is on it.
+    """
     into_cone = rests & (u.x < CONE_SHARE)
     rescaled = dr.select(into_cone, u.x / CONE_SHARE, (u.x - CONE_SHARE) / (1 - CONE_SHARE))
     u = mi.Point2f(dr.select(rests, rescaled, u.x), u.y)
     ω, _ = sample_direction(e, w, u)
-    ω = dr.select(into_cone, -cone.sample(u), ω)
-    return ω, pdf_view(e, w, cone, rests, ω)
+    forwards = u.x < ahead
+    rescaled = dr.select(forwards, u.x / max(ahead, dr.smallest(mi.Float)), (u.x - ahead) / (1 - ahead))
+    towards = cone.sample(mi.Point2f(rescaled, u.y))
+    ω = dr.select(into_cone, dr.select(forwards, towards, -towards), ω)
+    return ω, pdf_view(e, w, cone, rests, ahead, ω)
 
 
-def pdf_view(e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, ω: mi.Vector3f) -> mi.Float:
+def pdf_view(e: EdgeRows, w: Wedges, cone: Cone, rests: mi.Bool, ahead: float, ω: mi.Vector3f) -> mi.Float:
     """Density per solid angle of `sample_view`."""
     pdf = pdf_direction(e, w, ω)
-    return dr.select(rests, CONE_SHARE * cone.pdf(-ω) + (1 - CONE_SHARE) * pdf, pdf)
+    in_cone = ahead * cone.pdf(ω) + (1 - ahead) * cone.pdf(-ω)
+    return dr.select(rests, CONE_SHARE * in_cone + (1 - CONE_SHARE) * pdf, pdf)

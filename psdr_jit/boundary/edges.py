@@ -9,13 +9,14 @@ import mitsuba as mi
 
 from ..analytic_edges import CurveSet, curve_set
 from ..edge_distribution import EdgeDistribution, edge_distribution
+from ..edge_rows import EdgeRows
 from ..edge_set import EdgeSet, edge_set
 from ..job import Job
 from ..junctions import Ball
 from ..scene_analysis import ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box, sensor_frame
 from ..shape_pairs import warn_about_pairs
-from .edge_points import EdgePoint, curve_motion, curve_sides, segment_motion, segment_sides
+from .edge_points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,39 @@ def sides(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, wh
 
     `scale`: size of the shape, on curves. `differs` is False where both sides are certainly alike.
     """
+    side, differs = _side(table, row, t, point, scale, which)
+    ray = side.ray
+    ray.wavelengths = wavelengths
+    found = scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
+    return ray, dr.select(side.traced, found, side.pi), differs
+
+
+def background(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, which, wavelengths):
+    """What lies on side `which` of edge points and moves against them: `(ray, pi, r)`, `r` its distance from x_B.
+
+    The edge's own surface moves as the edge does and is left out (`pi` invalid), but for intersection curves and for
+    borders of several shapes at one place.
+    """
+    straight = row < table.segment_count
+    side, differs = _side(table, row, t, point, scale, which)
+    wanted = differs
+    if table.has_curves:
+        wanted &= straight | (which == 1)
+    if table.has_segments:
+        e = dr.gather(EdgeRows, table.segments.rows, row, straight)
+        own = straight & ~side.traced & (e.junction == 0) & ((e.shape0 == e.shape1) | ~e.moves)
+        wanted &= ~own
+    ray = side.ray
+    ray.wavelengths = wavelengths
+    found = scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & wanted)
+    pi = dr.select(side.traced, found, side.pi)
+    pi.valid = pi.valid & wanted
+    beyond = dr.dot(ray.o + pi.t * ray.d - point.x, ray.d)
+    return ray, pi, dr.select(side.traced, dr.maximum(beyond, 0), 0)
+
+
+def _side(table: EdgeTable, row, t, point: EdgePoint, scale, which) -> tuple[Side, mi.Bool]:
+    """Where to look on side `which`, and whether the two sides can differ."""
     straight = row < table.segment_count
     side, differs = None, mi.Bool(True)
     if table.has_segments:
@@ -120,10 +154,7 @@ def sides(scene: mi.Scene, table: EdgeTable, row, t, point: EdgePoint, scale, wh
         on_curve = curve_sides(point, table.centre, scale, which)
         side = on_curve if side is None else dr.select(straight, side, on_curve)
         differs |= ~straight
-    ray = side.ray
-    ray.wavelengths = wavelengths
-    found = scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & differs)
-    return ray, dr.select(side.traced, found, side.pi), differs
+    return side, differs
 
 
 def compact(record, active: mi.Bool):

@@ -62,28 +62,29 @@ class SecondaryEdges:
     distribution: EdgeDistribution
     movers: Movers | None
     resting: mi.Bool  # by row of the table: matters only through what slides; unused without movers
+    ahead: float = 0.0  # share of a resting edge's directions that look past it at the movers, not from them
 
     def sample_view(self, e: EdgeRows, w: Wedges, row, x: mi.Point3f, u: mi.Point2f, active) -> mi.Vector3f:
         """Direction ω through the point `x` of edges `e` = `row`, from the viewer's side."""
         if self.movers is None:
             return sample_direction(e, w, u)[0]
-        return sample_view(e, w, self.movers.seen_from(x), self._rests(row, active), u)[0]
+        return sample_view(e, w, self.movers.seen_from(x), self._rests(row, active), self.ahead, u)[0]
 
     def pdf_view(self, e: EdgeRows, w: Wedges, row, x: mi.Point3f, ω: mi.Vector3f, active) -> mi.Float:
         """Density per solid angle of `sample_view`."""
         if self.movers is None:
             return pdf_direction(e, w, ω)
-        return pdf_view(e, w, self.movers.seen_from(x), self._rests(row, active), ω)
+        return pdf_view(e, w, self.movers.seen_from(x), self._rests(row, active), self.ahead, ω)
 
     def _rests(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
         return dr.gather(mi.Bool, self.resting, row, active)
 
 
-def secondary_edges(job: Job, per_length, lights_count: bool) -> SecondaryEdges | None:
+def secondary_edges(job: Job, per_length, lights_count: bool, ahead: float = 0.0) -> SecondaryEdges | None:
     """All edges of the scene with weights for boundary segments anywhere; None if nothing can contribute.
 
     `per_length(rows)`: weight of straight edges per length; curves weigh π. `lights_count`: a light that moves makes
-    every edge matter (its shadows move).
+    every edge matter (its shadows move). `ahead`: see `SecondaryEdges`.
     """
     table = scene_edges(job)
     weights, resting, places = [], table.rests, []
@@ -106,7 +107,7 @@ def secondary_edges(job: Job, per_length, lights_count: bool) -> SecondaryEdges 
     if movers is not None:
         joined = [dr.select(r, mi.UInt32(1), 0) for r in resting]
         flags = (joined[0] if len(joined) == 1 else dr.concat(joined)) != 0
-    return SecondaryEdges(table, distribution, movers, flags)
+    return SecondaryEdges(table, distribution, movers, flags, ahead)
 
 
 def _movers(job: Job, lights_count: bool) -> Movers | None:

@@ -9,6 +9,9 @@ that subpath moves,
 with ω_k the direction of travel, away from the sensor, in which vertex k is reached. For one covector a applied to u_D
 the adjoint runs in walking order: deposit g = n (a·ω)/(n·ω) on v, then a ← a − g; what is left acts on the camera ray.
 
+In the material form only the first vertex of a light path slides. Hence a receiver that sees the sensor takes its
+deposit as above, one further along moves with its surface: all of a acts on its own v, and nothing is carried on.
+
 The walk is detached and leaves a record of every vertex: where a connection lands on the film, what it is worth, and
 both deposits (ω differs between "connect" and "continue"). Derivatives are then taken from the records: tangents are
 prefix sums along the walk, adjoints suffix sums.
@@ -153,6 +156,7 @@ def subpaths(
         value,
         a,
         PathLimits(longest, job.options.rr_depth),
+        job.options.form,
         records,
         mi.Bool(True),
     )
@@ -184,12 +188,14 @@ def walk_to_sensor(
     value: mi.Spectrum,
     a: mi.Vector3f,
     limits: PathLimits,
+    form: str,
     records: SubpathRecords,
     active: mi.Bool,
 ) -> None:
     """Trace the sensor subpath of x_D = the hit `pi` of `ray`; fills `records`. Detached.
 
     `value`: of the boundary segment over its density; `a`: covector on u_D. `limits.max_depth`: vertices at most.
+    `form`: one of `options.FORMS`.
     """
     max_depth, rr_depth = limits.max_depth, limits.rr_depth
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
@@ -224,7 +230,9 @@ def walk_to_sensor(
         bs = sample_scattering(ctx, si, bsdf, sampler.next_1d(), sampler.next_2d(), UNIFORM_SHARE, False, active)
         onward = si.to_world(bs.wo)
         weight = bs.weight * _adjoint_correction(si, onward)
-        g_continue = deposit(a, si.n, -onward)
+        g_continue = mi.Vector3f(a)
+        if dr.hint(form == "spatial", mode="scalar"):
+            g_continue = deposit(a, si.n, -onward)
         records.write(
             k,
             Connection(

@@ -57,8 +57,9 @@ def test_a_closed_box_is_not_looked_at_from_inside(variant):
     assert (front0 | front1).all() and (front0 & front1).any() and (front0 ^ front1).any()
 
 
+@pytest.mark.parametrize("ahead", [0.0, 0.5])
 @pytest.mark.parametrize("distance", [0.5, 3.0, 300.0])
-def test_the_mixture_of_a_resting_edge(variant, distance):
+def test_the_mixture_of_a_resting_edge(variant, distance, ahead):
     """The density of `sample_view` integrates to one, by importance sampling with itself and with its parts."""
     from psdr_jit.boundary.edge_directions import pdf_view, sample_view, silhouette_wedges, towards_sphere
 
@@ -67,15 +68,16 @@ def test_the_mixture_of_a_resting_edge(variant, distance):
     cone = towards_sphere(edge.p0, edge.p0 + mi.Vector3f(0.6, 0.8, 0) * distance, mi.Float(1))
     rests = mi.Bool(rng.random(COUNT) < 0.5)
     w = silhouette_wedges(edge)
-    ω, pdf = sample_view(edge, w, cone, rests, mi.Point2f(rng.random(COUNT), rng.random(COUNT)))
+    ω, pdf = sample_view(edge, w, cone, rests, ahead, mi.Point2f(rng.random(COUNT), rng.random(COUNT)))
     assert np.allclose(np.array(dr.norm(ω)), 1, atol=1e-5)
     assert np.array(pdf > 0).mean() > 0.999
     # 1 / pdf integrates the measure of the density's support: the lune, and for resting edges the cone as well
     support = np.array(cone.open)[0] * 2 * np.pi
-    inside = np.array(cone.pdf(-ω) > 0) & np.array(rests)
-    found = (inside / np.array(pdf)).sum() / np.array(rests).sum()
-    assert found == pytest.approx(support, rel=0.05)
-    assert np.allclose(np.array(pdf_view(edge, w, cone, rests, ω)), np.array(pdf))
+    for d in (-ω, ω) if ahead else (-ω,):
+        inside = np.array(cone.pdf(d) > 0) & np.array(rests)
+        found = (inside / np.array(pdf)).sum() / np.array(rests).sum()
+        assert found == pytest.approx(support, rel=0.05)
+    assert np.allclose(np.array(pdf_view(edge, w, cone, rests, ahead, ω)), np.array(pdf))
 
 
 def test_cone(variant):

@@ -1,0 +1,55 @@
+"""The material form: the same derivative as the spatial one on every scene, and forward and backward mode agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import adjoint_identity, assert_grad_close, fd, forward, load, motion_of, spec_of
+from problems import PROBLEMS, Problem
+from test_adjoint import CASES, SIZE, TOLERANCE
+
+from psdr_jit import integrators
+from psdr_jit.options import FORMS
+
+QUICK = ("cbox", "environment_shadow", "sunk_ball", "sunk_box")  # light that is scattered twice; curves of contact
+ADJOINT = ("sky", "shadow", "sunk-mesh", "sunk-ball", "floor-around-ball", "camera-pose", "area-light-pose", "radiance")
+
+
+def compare(p: Problem, seeds: int, spp: int, max_stderr: float) -> None:
+    scene = load(p)
+    motion = motion_of(p, scene)
+    spatial, material = (forward(motion, spec_of(scene, form=f, **p.options), seeds, spp) for f in FORMS)
+    if np.allclose(spatial, material, rtol=1e-4, atol=1e-5 * np.abs(spatial).max()):
+        return  # one vertex between light and sensor: the forms are the same
+    assert_grad_close(material, spatial, max_stderr)
+
+
+@pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in PROBLEMS if p.scene in QUICK and not p.slow])
+def test_forms_agree(llvm, problem):
+    compare(problem, seeds=24, spp=32, max_stderr=0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in PROBLEMS])
+def test_forms_agree_on_every_scene(llvm, problem):
+    compare(problem, seeds=64, spp=128, max_stderr=0.03)
+
+
+def test_material_form_against_finite_differences(llvm):
+    """A light behind a baffle: all that moves on the floor has been scattered before."""
+    problem = next(p for p in PROBLEMS if p.scene == "baffled_light")
+    scene = load(problem)
+    motion = motion_of(problem, scene)
+    estimate = forward(motion, spec_of(scene, form="material"), 24, 64)
+    reference = fd(motion, spec_of(scene), problem.eps, 24, 256)
+    assert_grad_close(estimate, reference, 0.06)
+
+
+@pytest.mark.parametrize("case", ADJOINT)
+def test_forward_and_backward_agree(variant, case):
+    scene_name, param, _ = CASES[case]
+    scene = load(Problem(scene_name, param, 0.0), **SIZE)
+    integrator = integrators.build(spec_of(scene, form="material", max_depth=4))
+    wJv, JTwv, w, Jv = adjoint_identity(scene, param, integrator)
+    assert Jv > 1e-6
+    assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
