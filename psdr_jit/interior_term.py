@@ -2,6 +2,7 @@
 
 Only paths that touch something differentiable have a derivative. When neither camera nor emitters are attached,
 a cheap first walk without shadow rays finds those paths and only they are recorded; the rest contribute exactly 0.
+Where that has turned out to be most of them, an integrator no longer looks.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from .ad import accumulate, tangents
 from .interior import SceneTraits, backward_sweep, forward_sweep
 from .job import Job, passes
 from .low_discrepancy import pixel_sampler
+from .material_tangents import MaterialTangents
 from .path_records import PathRecords
-from .path_steps import first_hit, walk
+from .path_steps import PathLimits, first_hit, walk
 from .scattering import UNIFORM_SHARE
 from .scene_analysis import SceneFacts
 from .streams import Stream, stream_seed
@@ -26,6 +28,10 @@ from .touch import count_vertices, touches
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
+
+
+#: Share of paths with a derivative from which looking for them costs more than it saves; the others contribute 0.
+MOST_PATHS = 0.6
 
 
 @dataclass(frozen=True)
@@ -82,25 +88,45 @@ def touch_table(job: Job) -> mi.UInt32:
     return mi.UInt32(table)
 
 
-def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
-    """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
+def only_materials(facts: SceneFacts) -> bool:
+    """Do all enabled parameters belong to BSDFs? Then paths, emission and shading frames are constants."""
+    emission = any(e.pose or e.radiance for e in facts.emitters)
+    return not (facts.geometry_moves or emission or any(s.shading for s in facts.shapes))
+
+
+def _limits(job: Job) -> PathLimits:
     facts = job.facts
     # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
     material = any(s.material for s in facts.shapes)
     rough_glass = any(s.bsdf_flags & int(mi.BSDFFlags.GlossyTransmission) for s in facts.shapes)
     limits = replace(job.limits, end_black=not material, refuses=material and rough_glass)
-    if facts.geometry_moves:
-        limits = replace(limits, uniform_share=UNIFORM_SHARE)
+    return replace(limits, uniform_share=UNIFORM_SHARE) if facts.geometry_moves else limits
+
+
+def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
+    """Derivative of every path's radiance by the materials it meets, without records."""
+    ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
+    sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
+    sink = MaterialTangents.zero()
+    walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
+    return job.rejected.keep_finite(sink.dL)
+
+
+def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
+    """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
+    facts = job.facts
+    limits = _limits(job)
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
     lane = dr.arange(mi.UInt32, dr.width(p.pos))
     dr.eval(ray, lane)
 
-    if not every_path_differs(facts):
+    if not every_path_differs(facts) and job.cache.get("touched share", 0) < MOST_PATHS:
         sampler = pixel_sampler(p.seed, lane, p.spp)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
+        job.cache["touched share"] = dr.width(lane) / dr.width(found)
         if dr.width(lane) == 0:
             return PathRecords(0, 0), lane
         ray = dr.gather(mi.Ray3f, ray, lane)
@@ -133,23 +159,30 @@ def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
     return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
 
 
+def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
+    """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
+    if only_materials(job.facts):
+        return _along_the_walk(job, p)
+    records, lane = _record(job, p)
+    dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+    if dr.width(lane) > 0:
+        o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+        if job.facts.camera_moves:
+            with dr.resume_grad():
+                o_grad, d_grad = tangents(p.ray.o, p.ray.d)
+            o_grad = o_grad + _skipped(job, p, records) * d_grad
+        recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job))
+        dr.scatter(dL, job.rejected.keep_finite(recorded), lane)
+        dr.eval(dL)  # the splat reads it inside a recorded loop, where pending writes are not seen
+    return dL
+
+
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
     image = 0
     with dr.suspend_grad():
         for p in _camera_passes(job):
-            records, lane = _record(job, p)
-            dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
-            if dr.width(lane) > 0:
-                o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-                if job.facts.camera_moves:
-                    with dr.resume_grad():
-                        o_grad, d_grad = tangents(p.ray.o, p.ray.d)
-                    o_grad = o_grad + _skipped(job, p, records) * d_grad
-                recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job))
-                recorded = job.rejected.keep_finite(recorded)
-                dr.scatter(dL, recorded, lane)
-                dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
+            dL = _derivatives(job, p)
             image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
     return image
 

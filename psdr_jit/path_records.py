@@ -45,6 +45,9 @@ class PathRecords:
     def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
         """Not needed: the sweeps add up radiance themselves."""
 
+    def scattered(self, k: mi.UInt32, scatter, active: mi.Bool) -> None:
+        """Not needed: the sweeps evaluate materials again."""
+
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex `k` of the active lanes (the sink interface of `path_steps.walk`)."""
         dr.scatter(self.vertices, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)

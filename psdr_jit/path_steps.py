@@ -57,6 +57,24 @@ def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSam
     return Hit.of(ray, pi), active & dr.select(on_surface, reached, ~pi.is_valid())
 
 
+@dataclass
+class Scatter:
+    """Emission and scattering at one vertex, while they are at hand. Detached."""
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    β: mi.Spectrum  # throughput before the vertex
+    emission: mi.Spectrum  # of the vertex itself, times its MIS weight
+    sees_emitter: mi.Bool
+    ω_em: mi.Vector3f  # emitter sample, local
+    from_emitter: mi.Spectrum  # what it sends, times MIS weight over density
+    goes_on: mi.Bool
+    wo: mi.Vector3f  # continuation, local
+    delta: mi.Bool
+    inv_pdf: mi.Float  # 1/(pdf · roulette) of a smooth lobe
+    weight: mi.Spectrum  # factor on the throughput
+
+
 class NoSink:
     """Receives the vertices of a walk and forgets them."""
 
@@ -67,6 +85,9 @@ class NoSink:
 
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex number `k` (0: the first) of every active lane."""
+
+    def scattered(self, k: mi.UInt32, scatter: Scatter, active: mi.Bool) -> None:
+        """What scattering at vertex `k` was made of, for whoever needs it at once."""
 
 
 def continue_path(sampler, β: mi.Spectrum, η: mi.Float, k: mi.UInt32, rr_depth: int, end_black: bool = True):
@@ -174,7 +195,8 @@ def walk(
         ds = mi.DirectionSample3f(scene, si=si, ref=prev)
         pdf_em = scene.pdf_emitter_direction(prev, ds, ~prev_delta)
         weight_emission = dr.select(emission, mis_weight(prev_pdf, pdf_em), 0)
-        L += β * weight_emission * ds.emitter.eval(si, emission)
+        L_here = weight_emission * ds.emitter.eval(si, emission)
+        L += β * L_here
 
         sink.radiance(k, L, active)
 
@@ -183,7 +205,8 @@ def walk(
         active_em = alive & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, value_em = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
         hit_em, active_em = sink.connect(scene, si, ds, active_em & (ds.pdf > 0))
-        f_em, pdf_bsdf, bs = _evaluate_and_sample(ctx, si, bsdf, si.to_local(ds.d), sampler, share, refuses, alive)
+        ω_em = si.to_local(ds.d)
+        f_em, pdf_bsdf, bs = _evaluate_and_sample(ctx, si, bsdf, ω_em, sampler, share, refuses, alive)
         mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf_bsdf))
         L[active_em] += β * mis_em * f_em * value_em
 
@@ -206,6 +229,25 @@ def walk(
                     weight=dr.select(active_em, mis_em / ds.pdf, 0),
                 ),
                 inv_pdf=dr.select(alive, dr.select(bs.delta, -inv_survival, inv_survival) / bs.pdf, 0),
+            ),
+            active,
+        )
+
+        sink.scattered(
+            k,
+            Scatter(
+                si=si,
+                bsdf=bsdf,
+                β=β,
+                emission=L_here,
+                sees_emitter=active_em,
+                ω_em=ω_em,
+                from_emitter=mis_em * value_em,
+                goes_on=alive,
+                wo=bs.wo,
+                delta=bs.delta,
+                inv_pdf=inv_survival / bs.pdf,
+                weight=bs.weight * inv_survival,
             ),
             active,
         )

@@ -13,11 +13,13 @@ class Rejected:
         self._count = mi.UInt32(0)
 
     def keep_finite(self, value: mi.Spectrum) -> mi.Spectrum:
-        """`value` with 0 in lanes where any component is NaN or infinite; those lanes are counted. Detached."""
+        """`value` with 0 in lanes where any component is NaN or infinite; those are counted. Detached, evaluated."""
         sound = dr.all(dr.isfinite(value))
-        self._count += dr.sum(dr.select(sound, mi.UInt32(0), 1))
+        kept, dropped = dr.select(sound, value, 0), dr.select(sound, mi.UInt32(0), 1)
+        dr.eval(kept, dropped)  # at once: the sum alone would run whatever made `value`, and its use once more
+        self._count += dr.sum(dropped)
         dr.schedule(self._count)
-        return dr.select(sound, value, 0)
+        return kept
 
     def __int__(self) -> int:
         return int(self._count[0])

@@ -23,7 +23,7 @@ RANK = {
     "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "params": 1, "llvm_fetch": 1, "scene_io": 1,
     "scene_probes": 2, "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
-    "intersections": 2, "perturbation": 2, "llvm": 2,
+    "intersections": 2, "material_tangents": 2, "perturbation": 2, "llvm": 2,
     "scene_analysis": 3, "interior": 3, "drjit_libraries": 3,
     "scene_checks": 4, "job": 4,
     "edge_rows": 2, "junctions": 5, "junction_points": 6, "shape_pairs": 3,
