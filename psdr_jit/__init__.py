@@ -27,12 +27,16 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .check import CheckResult, check_gradient
     from .gradient import GradientResult, gradient
     from .params import ParamInfo, differentiable_params
+    from .plan import Plan
+    from .planning import make_plan
 
     __all__ = [
         "CheckResult",
         "GradientResult",
         "ParamInfo",
+        "Plan",
         "check_gradient",
         "differentiable_params",
         "gradient",
+        "make_plan",
     ]

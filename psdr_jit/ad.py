@@ -14,8 +14,12 @@ def tangents(*values):
 
 
 def accumulate(value) -> None:
-    """Backward-propagate a scalar, leaving the scene's edges in place for the terms that follow."""
-    dr.backward_from(value, flags=dr.ADFlag.ClearVertices)
+    """Backward-propagate a scalar, leaving the scene's edges in place for the terms that follow.
+
+    A value that does not depend on any parameter has nothing to say.
+    """
+    if dr.grad_enabled(value):
+        dr.backward_from(value, flags=dr.ADFlag.ClearVertices)
 
 
 def backpropagate(image, grad_in) -> None:

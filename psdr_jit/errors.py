@@ -31,5 +31,9 @@ class SetupError(PsdrError, RuntimeError):
     """The machine lacks something psdr_jit needs, such as a working LLVM."""
 
 
+class ZeroDerivativeWarning(UserWarning):
+    """The derivative is 0 everywhere; the message says why."""
+
+
 class UnsupportedWarning(UserWarning):
     """A part of the derivative is not modelled; the message names it."""

@@ -22,7 +22,6 @@ from .material_tangents import MaterialTangents
 from .path_records import PathRecords
 from .path_steps import PathLimits, first_hit, walk
 from .scattering import UNIFORM_SHARE
-from .scene_analysis import SceneFacts
 from .streams import Stream, stream_seed
 from .touch import count_vertices, touches
 
@@ -71,11 +70,12 @@ def _camera_passes(job: Job) -> Iterator[_Pass]:
         yield _Pass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
 
 
-def every_path_differs(facts: SceneFacts) -> bool:
+def every_path_differs(job: Job) -> bool:
     """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
+    facts = job.facts
     emission = any(e.pose or e.radiance for e in facts.emitters)
     moving_lights = any(s.is_emitter and (s.geometry or s.shading) for s in facts.shapes)
-    return facts.camera_moves or emission or moving_lights
+    return facts.camera_moves or emission or moving_lights or not job.plan.prunes
 
 
 def touch_table(job: Job) -> mi.UInt32:
@@ -88,10 +88,12 @@ def touch_table(job: Job) -> mi.UInt32:
     return mi.UInt32(table)
 
 
-def only_materials(facts: SceneFacts) -> bool:
+def only_materials(job: Job) -> bool:
     """Do all enabled parameters belong to BSDFs? Then paths, emission and shading frames are constants."""
+    facts = job.facts
     emission = any(e.pose or e.radiance for e in facts.emitters)
-    return not (facts.geometry_moves or emission or any(s.shading for s in facts.shapes))
+    changes = facts.geometry_moves or emission or any(s.shading for s in facts.shapes)
+    return job.plan.prunes and not changes
 
 
 def _limits(job: Job) -> PathLimits:
@@ -114,7 +116,6 @@ def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
 
 def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
-    facts = job.facts
     limits = _limits(job)
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
@@ -122,7 +123,7 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     lane = dr.arange(mi.UInt32, dr.width(p.pos))
     dr.eval(ray, lane)
 
-    if not every_path_differs(facts) and job.cache.get("touched share", 0) < MOST_PATHS:
+    if not every_path_differs(job) and job.cache.get("touched share", 0) < MOST_PATHS:
         sampler = pixel_sampler(p.seed, lane, p.spp)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
@@ -148,7 +149,8 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
 def _traits(job: Job) -> SceneTraits:
     facts = job.facts
     delta_lobes = any(s.delta_lobes for s in facts.shapes)
-    return SceneTraits(facts.has_delta_emitters, delta_lobes, facts.geometry_moves, job.options.form)
+    moves = facts.geometry_moves or not job.plan.prunes
+    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form)
 
 
 def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
@@ -161,7 +163,7 @@ def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
 
 def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
     """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
-    if only_materials(job.facts):
+    if only_materials(job):
         return _along_the_walk(job, p)
     records, lane = _record(job, p)
     dL = dr.zeros(mi.Spectrum, dr.width(p.pos))

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from .options import Options
 from .path_steps import PathLimits
+from .plan import Plan
 from .rejected import Rejected
 from .scene_analysis import SceneFacts
 
@@ -22,6 +23,7 @@ class Job:
     sensor: mi.Sensor
     facts: SceneFacts
     options: Options
+    plan: Plan
     cache: dict  # the integrator's: edge sets that outlive a call
     shared: dict  # of all terms of one render call
     rejected: Rejected  # the integrator's: counts dropped samples
@@ -31,6 +33,11 @@ class Job:
     @property
     def film(self) -> mi.Film:
         return self.sensor.film()
+
+    @property
+    def form(self) -> str:
+        """What path vertices do while θ changes, see `options.FORMS`."""
+        return self.plan.form
 
     @property
     def limits(self) -> PathLimits:

@@ -13,6 +13,12 @@ UNLIMITED = 0xFFFFFFFF
 #: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points.
 FORMS = ("spatial", "material")
 
+#: Leave out what does not contribute, or compute everything, for comparison.
+PLANS = ("lean", "full")
+
+#: Forward mode may rely on the direction that is set on the parameters: what has velocity 0 is left out as well.
+DIRECTIONS = ("any", "known")
+
 
 @dataclass(frozen=True)
 class Options:
@@ -30,7 +36,9 @@ class Options:
     sppi: int | None = None  # samples per pixel, default of each secondary boundary term
     sppd: int | None = None  # samples per pixel, direct boundary term; overrides sppi
     record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes
-    form: str = "spatial"  # one of FORMS
+    form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
+    plan: str = "lean"  # one of PLANS
+    direction: str = "any"  # one of DIRECTIONS
 
     def __post_init__(self):
         for field in fields(self):
@@ -45,8 +53,9 @@ class Options:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
-        if self.form not in FORMS:
-            raise OptionError(f"form = {self.form!r}: use {' or '.join(FORMS)}")
+        for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS)):
+            if getattr(self, name) not in words:
+                raise OptionError(f"{name} = {getattr(self, name)!r}: use {', '.join(words[:-1])} or {words[-1]}")
         if self.record_mib < 16:
             raise OptionError(f"record_mib = {self.record_mib}: at least 16 MiB are needed")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from psdr_jit.compat import VERTEX_NORMALS, VERTEX_POSITIONS
 from psdr_jit.errors import ParameterError, SceneError
 
 
@@ -46,6 +49,53 @@ def find_param(scene: Any, name: str, params: Any = None) -> ParamInfo:
         raise ParameterError(f"parameter '{name}' cannot be differentiated: {info.reason}. "
                              "'psdr params SCENE.xml' lists those that can")
     return info
+
+
+@contextmanager
+def also_enabled(scene: Any, names: Sequence[str]) -> Iterator[None]:
+    """With gradients of these parameters enabled; afterwards the scene is as it was. Raises `ParameterError`."""
+    if not names:
+        yield
+        return
+    params = _traversed(scene)
+    before = {}
+    for name in names:
+        before |= values_to_keep(params, find_param(scene, name, params).name)
+    try:
+        for name in names:
+            _assign(params, name, _attached(before[name]))
+        params.update()
+        yield
+    finally:
+        for name, value in before.items():
+            _assign(params, name, type(value)(value))
+        params.update()
+
+
+def values_to_keep(params: Any, name: str) -> dict[str, Any]:
+    """Copies of the parameter and of what Mitsuba recomputes from it; still attached where they are."""
+    kept = {name: type(params[name])(params[name])}  # not the value itself, which Mitsuba writes into
+    if name.endswith(VERTEX_POSITIONS):
+        normals = name[: -len(VERTEX_POSITIONS)] + VERTEX_NORMALS
+        if normals in params and dr.width(params[normals]) > 0:
+            kept[normals] = type(params[normals])(params[normals])
+    return kept
+
+
+def _assign(params: Any, name: str, value: Any) -> None:
+    params[name] = value
+    params.set_dirty(name)
+
+
+def _attached(value: Any) -> Any:
+    """An attached copy."""
+    if is_transform(value):
+        offset = dr.zeros(mi.Vector3f)
+        dr.enable_grad(offset)
+        return type(value)().translate(offset) @ value
+    copy = type(value)(dr.detach(value))
+    dr.enable_grad(copy)
+    return copy
 
 
 def _traversed(scene: Any) -> Any:

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.errors import ParameterError, SceneError
-from psdr_jit.params import ParamInfo, find_param, is_transform
+from psdr_jit.params import ParamInfo, find_param, is_transform, values_to_keep
 
 
 @dataclass(frozen=True)
@@ -97,13 +97,8 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
         raise ParameterError(f"index must be a whole number, got {index!r}")
     if sum(x is not None for x in (direction, rotate, index)) > 1:
         raise ParameterError("give one of direction, rotate and index, not several")
-    base = dr.detach(params[name])
-    base = type(base)(base)
-    originals = {name: base}
-    if name.endswith("vertex_positions"):
-        normals = name[: -len("vertex_positions")] + "vertex_normals"
-        if normals in params and dr.width(params[normals]) > 0:
-            originals[normals] = type(params[normals])(dr.detach(params[normals]))
+    originals = {name: dr.detach(value) for name, value in values_to_keep(params, name).items()}
+    base = originals[name]
     position = name.rsplit(".", 1)[-1] == "position"
     movable = name.endswith("vertex_positions") or info.shape == (4, 4) or position
     common = dict(scene=scene, params=params, info=info, originals=originals)

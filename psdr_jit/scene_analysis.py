@@ -7,6 +7,7 @@ prints the table of what is supported.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -26,7 +27,7 @@ from .scene_probes import (
     sees_frame,
     weights_of_delta_lobes,
 )
-from .support import ANALYTIC_SHAPES, POSE_PARAMETERS, UNSUPPORTED_SHAPES, support_table
+from .support import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES, support_table
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class EmitterFacts:
     shape: int  # index in SceneFacts.shapes, -1 if it has none
     delta: bool  # a point or a direction: reached by emitter sampling only
     infinite: bool
+    varies: bool  # what is seen of it directly differs from point to point or with the direction
     hard_edge: bool  # a spot whose cone has no soft rim
     jumps: tuple[str, ...]  # discontinuous textures
     pose: tuple[str, ...]  # enabled parameters that move it
@@ -100,6 +102,7 @@ class SceneFacts:
     enabled: tuple[str, ...]  # all parameters with gradients enabled, as `mi.traverse(scene)` names them
     extent: float  # diagonal of the scene's bounding box [scene units], 0 without shapes
     reach: float  # largest coordinate of that box [scene units]
+    still: str = ""  # why nothing counts as enabled though gradients are
 
     @property
     def anything_enabled(self) -> bool:
@@ -152,11 +155,14 @@ class SceneFacts:
         return "\n".join(lines)
 
 
-def analyse(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> SceneFacts:
+def analyse(
+    scene: mi.Scene, sensor: mi.Sensor | int = 0, counts: Callable[[object], bool] = lambda value: True
+) -> SceneFacts:
     """Collect the facts about `scene` as seen by `sensor` (the sensor itself, or its number).
 
-    Gradients that are merely suspended (`dr.suspend_grad`) count as enabled. Costs milliseconds and one
-    synchronisation, so it can be repeated whenever parameters change.
+    `counts(value)`: whether a parameter value with gradients enabled counts as such. Gradients that are merely
+    suspended (`dr.suspend_grad`) are enabled. Costs milliseconds and one synchronisation, so it can be repeated
+    whenever parameters change.
     """
     if not dr.is_diff_v(mi.Float):
         raise UnsupportedError(
@@ -164,7 +170,7 @@ def analyse(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> SceneFacts:
         )
     with dr.resume_grad():
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        graph = SceneGraph(scene, sensor)
+        graph = SceneGraph(scene, sensor, counts)
         scene_shapes = list(scene.shapes())
         shapes = scene_shapes + [s for s in graph.shapes_in_groups() if s not in scene_shapes]
         bad_vertices = non_finite_vertices(shapes)
@@ -247,6 +253,7 @@ def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: l
         shape=owners[0] if owners else -1,
         delta=bool(flags & int(mi.EmitterFlags.Delta)),
         infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
+        varies=plugin_name(emitter) not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
         hard_edge=is_hard_edged(graph, emitter),
         jumps=jumping_textures(graph, emitter),
         pose=pose,

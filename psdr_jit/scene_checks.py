@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from .compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
-from .errors import ParameterError, PsdrError, SceneError, UnsupportedError, UnsupportedWarning
+from .errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
 from .mesh_edges import EdgeTopology
 from .scene_analysis import SceneFacts, ShapeFacts
 from .support import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
@@ -62,11 +62,13 @@ def findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_parameters(facts: SceneFacts) -> Iterator[Finding]:
-    """There must be something to differentiate."""
-    if not facts.anything_enabled:
+    """Without anything to differentiate, the answer is 0."""
+    if facts.still:
+        yield Finding(ZeroDerivativeWarning, "", f"the derivative is 0: {facts.still}")
+    elif not facts.anything_enabled:
         yield Finding(
-            ParameterError, "",
-            "no scene parameter has gradients enabled: after params = mi.traverse(scene), call "
+            ZeroDerivativeWarning, "",
+            "the derivative is 0: no scene parameter has gradients enabled; after params = mi.traverse(scene), call "
             "dr.enable_grad(params['shape.to_world']) (or assign a value that depends on a variable with "
             "gradients), then params.update(), and render with mi.render(scene, params)",
         )  # fmt: skip
@@ -167,8 +169,7 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
 
 def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
     """The sweeps take the weight and the direction of a delta lobe for constants (see `interior.vertex_terms`)."""
-    for shape in facts.shapes:
-        # moving geometry, which attaches the normals as well, is refused by `check_specular`
+    for shape in facts.shapes:  # moving geometry, which attaches the normals too, is refused by `check_specular`
         watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
         steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]
         enabled = list(shape.delta_weights) + [f"{shape.name}.{name}" for name in steering]

@@ -6,6 +6,7 @@ rest is probed on the object, without tracing a ray.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import drjit as dr
@@ -33,7 +34,9 @@ class SceneGraph:
     `mi.traverse` visits a shared object once and under one name; here every owner finds it.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, counts: Callable[[object], bool]):
+        """`counts(value)`: does this parameter value, whose gradients are enabled, count as such?"""
+        self._counts = counts
         params = mi.traverse(scene)
         self._nodes = list(params.hierarchy)  # keeps the nodes, and with them their ids, alive
         self._values: dict[int, dict[str, object]] = {}  # id(node) -> parameter -> value
@@ -49,7 +52,7 @@ class SceneGraph:
         for name, (_, _, node, _) in params.properties.items():
             value = parameter_value(params, name)
             self._values.setdefault(id(node), {})[_last(name)] = value
-            if _grad_enabled(value):
+            if _grad_enabled(value) and self._counts(value):
                 self._enabled[prefix + name] = id(node)
 
     def enabled_names(self) -> tuple[str, ...]:

@@ -64,6 +64,9 @@ FRAME_FREE_PLUGINS = frozenset({
 SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance")})
 """(plugin, parameter) of materials with a delta lobe: those that only shape the smooth lobe beside it."""
 
+UNIFORM_EMITTERS = frozenset({"area", "constant", "point", "spot", "directional"})
+"""Lights that look the same from everywhere unless textured, or cannot be seen at all."""
+
 POSE_PARAMETERS = frozenset({
     "to_world", "position", "direction", "sun_direction",
     "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second",

@@ -23,11 +23,12 @@ class Term:
     budget: str
     forward: Callable[[Job], mi.TensorXf]
     backward: Callable[[Job, mi.TensorXf], None]
+    weights: Callable[[Job], mi.Float | None] | None = None  # of the edges it samples, by row of the edge table
 
 
 TERMS = (
     Term("interior", "sppc", interior_term.forward, interior_term.backward),
-    Term("primary", "sppp", primary.forward, primary.backward),
-    Term("direct", "sppd", direct.forward, direct.backward),
-    Term("indirect", "sppi", indirect.forward, indirect.backward),
+    Term("primary", "sppp", primary.forward, primary.backward, primary.edge_weights),
+    Term("direct", "sppd", direct.forward, direct.backward, direct.edge_weights),
+    Term("indirect", "sppi", indirect.forward, indirect.backward, indirect.edge_weights),
 )

@@ -21,21 +21,22 @@ RANK = {
     "low_discrepancy": 0, "rejected": 0,
     # host-side descriptions
     "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
-    "params": 1, "llvm_fetch": 1, "scene_io": 1,
-    "scene_probes": 2, "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
-    "intersections": 2, "material_tangents": 2, "perturbation": 2, "llvm": 2,
-    "scene_analysis": 3, "interior": 3, "drjit_libraries": 3,
-    "scene_checks": 4, "job": 4,
-    "edge_rows": 2, "junctions": 5, "junction_points": 6, "shape_pairs": 3,
-    "edge_set": 6,
+    "llvm_fetch": 1, "scene_io": 1,
+    "params": 2, "scene_probes": 3,
+    "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
+    "intersections": 2, "material_tangents": 2, "perturbation": 3, "llvm": 2,
+    "scene_analysis": 4, "interior": 3, "drjit_libraries": 3,
+    "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "job": 6,
+    "edge_rows": 2, "junctions": 6, "junction_points": 7, "shape_pairs": 3,
+    "edge_set": 7,
     # estimators
-    "boundary": 7, "interior_term": 7,
-    "terms": 8,
+    "boundary": 8, "interior_term": 8,
+    "terms": 9,
     # plugins and the tools on top of them
-    "plugins": 9, "integrators": 9,
-    "gradient": 10, "finite_differences": 10,
-    "check": 11, "demo": 11,
-    "cli": 12,
+    "integrators": 10, "planning": 11, "plugins": 12,
+    "gradient": 13, "finite_differences": 13,
+    "check": 14, "demo": 14,
+    "cli": 15,
 }  # fmt: skip
 """Stage of each module or package; an import must lead to a lower one, or stay within a package."""
 

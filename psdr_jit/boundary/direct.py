@@ -36,7 +36,7 @@ from .edge_sources import source_from_curve, source_from_segment
 from .edges import compact, edge_samples, shared_frame
 from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
 from .secondary import BoundarySamples
-from .sensor_subpath import UNLIMITED_VERTICES, subpaths
+from .sensor_subpath import UNLIMITED_VERTICES, recorded_vertices, subpaths
 
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
 #: are drawn as make about one path per sample.
@@ -124,7 +124,7 @@ def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> Boun
 
 def longest_subpath(job: Job) -> int:
     """Vertices from the sensor to the receiver, at most: one segment is left for the emitter."""
-    return job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
 
 
 def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
@@ -158,10 +158,20 @@ def _shadow_weight(job: Job, rows: EdgeRows) -> mi.Float:
     return dr.select(casts, wedge_measure(silhouette_wedges(rows)), 0)
 
 
+def _edges(job: Job) -> SecondaryEdges | None:
+    return secondary_edges(job, lambda rows: _shadow_weight(job, rows), lights_count=True)
+
+
+def edge_weights(job: Job) -> mi.Float | None:
+    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
+    edges = _edges(job)
+    return None if edges is None else edges.distribution.weight
+
+
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = shared_frame(job)
-    edges = secondary_edges(job, lambda rows: _shadow_weight(job, rows), lights_count=True)
+    edges = _edges(job)
     if edges is None:
         return None
     segment = sample_segments(job, frame, edges)

@@ -38,7 +38,7 @@ from .edge_points import (
 )
 from .edges import compact, edge_samples
 from .relevance import SecondaryEdges
-from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords
+from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, recorded_vertices
 
 
 @dataclass
@@ -130,7 +130,7 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges, wedges_of=
     ω, side, pdf = line.ω, line.side, line.pdf_sa
     down = mi.Ray3f(line.x + beside - line.lead * ω, -ω, 0, wavelengths)
     pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
-    if job.scene.environment() is not None and job.options.form == "spatial":
+    if job.scene.environment() is not None and job.form == "spatial":
         # Lines of which one end escapes have their receiver at the other, whichever direction was drawn.
         up = mi.Ray3f(line.x + beside + line.lead * ω, ω, 0, wavelengths)
         other = job.scene.ray_intersect_preliminary(up, coherent=False, active=line.valid)
@@ -178,4 +178,4 @@ def radiance_by_depth(job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: in
 
 def longest_subpath(job: Job) -> int:
     """Vertices from the sensor to the receiver, at most: the edge's side and an emitter take a segment each."""
-    return job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+    return recorded_vertices(job, job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES)

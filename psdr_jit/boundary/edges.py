@@ -16,6 +16,7 @@ from ..junctions import Ball
 from ..scene_analysis import ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box, sensor_frame
 from ..shape_pairs import warn_about_pairs
+from ..velocities import vertex_speeds
 from .edge_points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
 
 
@@ -90,6 +91,10 @@ def _edge_table(job: Job) -> EdgeTable:
         rows = segments.rows  # not in place: the arrays may be those of the cached topology
         rows.shell0 = rows.shell0 * dr.gather(mi.Float, outside, rows.shape0)
         rows.shell1 = rows.shell1 * dr.gather(mi.Float, outside, rows.shape1)
+        if job.options.direction == "known" and job.plan.prunes:
+            speed = vertex_speeds(segments.meshes)
+            moved = sum(dr.gather(mi.Float, speed, v) for v in (rows.v0, rows.v1)) > 0
+            rows.moves = rows.moves & (moved | (rows.junction > 0))
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     centre = dr.opaque(mi.Point3f, list(job.scene.bbox().center()))
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre)

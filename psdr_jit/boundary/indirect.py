@@ -24,7 +24,7 @@ from . import background, secondary
 from .edge_directions import wedge_measure, wedges
 from .edge_views import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
 from .edges import EdgeTable, shared_frame, sides
-from .relevance import secondary_edges
+from .relevance import SecondaryEdges, secondary_edges
 from .secondary import BoundarySamples
 from .sensor_subpath import SubpathRecords, subpaths
 
@@ -56,10 +56,14 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     return radiance_by_depth(job, ray, pi, v.lane, vertices, differs)
 
 
+def _spatial_edges(job: Job) -> SecondaryEdges | None:
+    return secondary_edges(job, lambda rows: wedge_measure(wedges(rows)), lights_count=False)
+
+
 def _prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded, in spatial form; None if there is nothing to sample."""
     frame = shared_frame(job)
-    edges = secondary_edges(job, lambda rows: wedge_measure(wedges(rows)), lights_count=False)
+    edges = _spatial_edges(job)
     if edges is None:
         return None
     table = edges.table
@@ -93,15 +97,22 @@ def _prepared(job: Job) -> BoundarySamples | None:
     )
 
 
-#: How the term is estimated, by form.
+#: Which edges are sampled, and how the term is estimated, by form.
+EDGES = {"spatial": _spatial_edges, "material": background.background_edges}
 PREPARE = {"spatial": _prepared, "material": background.prepared}
+
+
+def edge_weights(job: Job) -> mi.Float | None:
+    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
+    edges = EDGES[job.form](job)
+    return None if edges is None else edges.distribution.weight
 
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
-    return secondary.forward(job, PREPARE[job.options.form], longest_subpath(job))
+    return secondary.forward(job, PREPARE[job.form], longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    secondary.backward(job, PREPARE[job.options.form], longest_subpath(job), grad_in)
+    secondary.backward(job, PREPARE[job.form], longest_subpath(job), grad_in)

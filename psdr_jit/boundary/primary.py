@@ -67,10 +67,16 @@ def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
         weights.append(film_weights.segment_weights(table.segments, frame, border))
     if table.has_curves:
         weights.append(film_weights.curve_weights(table.curves, frame, border))
-    if not job.facts.camera_moves:
+    if not job.facts.camera_moves and job.plan.prunes:
         weights = [dr.select(rests, 0, w) for w, rests in zip(weights, table.rests, strict=True)]
     distribution = distribution_of(weights)
     return None if distribution is None else PrimaryEdges(table, distribution)
+
+
+def edge_weights(job: Job) -> mi.Float | None:
+    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
+    edges = primary_edges(job, shared_frame(job))
+    return None if edges is None else edges.distribution.weight
 
 
 @dataclass

@@ -115,7 +115,7 @@ def _movers(job: Job, lights_count: bool) -> Movers | None:
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]
-    if facts.camera_moves or (lights_count and light_moves) or not moving:
+    if facts.camera_moves or (lights_count and light_moves) or not moving or not job.plan.prunes:
         return None
     shapes = job.scene.shapes()
     box = mi.ScalarBoundingBox3f()
@@ -143,7 +143,7 @@ def can_cast_shadow(job: Job, rows: EdgeRows) -> mi.Bool:
     corners of a light's bounding box alike, it is alike from all of the light.
     """
     emitters = job.scene.emitters()
-    if len(emitters) > MAX_EMITTERS:
+    if len(emitters) > MAX_EMITTERS or not job.plan.prunes:
         return mi.Bool(True)
     found = mi.Bool(False)
     for emitter, facts in zip(emitters, job.facts.emitters, strict=True):

@@ -100,6 +100,16 @@ class SubpathRecords:
         return dr.gather(mi.Float, values, self.lane) + dr.gather(mi.Float, after, self.lane)
 
 
+def recorded_vertices(job: Job, limit: int) -> int:
+    """Vertices of a sensor subpath of at most `limit` that can move against anything.
+
+    While only the camera moves, nothing but the first vertex of a light path slides in the material form.
+    """
+    facts = job.facts
+    only_camera = job.form == "material" and not (facts.shapes_move or facts.emitters_move)
+    return min(limit, 1) if only_camera and job.plan.prunes else limit
+
+
 class _Flat:
     """A flat output array that a recorded loop scatters into, hidden from its state."""
 
@@ -156,7 +166,7 @@ def subpaths(
         value,
         a,
         PathLimits(longest, job.options.rr_depth),
-        job.options.form,
+        job.form,
         records,
         mi.Bool(True),
     )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from psdr_jit.errors import OptionError
 
@@ -80,3 +81,13 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, st
     finally:
         if started:
             bar.stop()
+
+
+def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:
+    """The scene's own `psdr_path` with all its options, or ours with the scene's path lengths."""
+    from psdr_jit import integrators, scene_io
+
+    named = getattr(args, "integrator", None) or integrators.DEFAULT_INTEGRATOR
+    own = scene_io.integrator_properties(args.scene, **definitions(args))
+    given: Mapping[str, Any] | str = own if own.get("type") == named else named
+    return integrators.integrator_spec(scene, given, max_depth=args.max_depth)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     scene_io.use_variant(args.variant)
     scene = scene_io.load_scene(args.scene, **_common.definitions(args))
     scene_io.check_sensor(scene, args.sensor)
-    spec = integrator_of(args, scene)
+    spec = _common.integrator_of(args, scene)
     parameter = perturb(scene, args.wrt, args.direction, rotate=args.rotate, index=args.index)
     with _common.progress_bar("gradient", args.quiet) as report:
         result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds,
@@ -79,16 +78,6 @@ def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
     if named.suffix.lower() not in (".exr", ".png", ""):
         raise OptionError(f"cannot write '{named}': the name must end in .exr (a .png is written beside it)")
     return images.check_writable(named.with_suffix(".exr")), images.check_writable(named.with_suffix(".png"))
-
-
-def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:
-    """The scene's own `psdr_path` with all its options, or ours with the scene's path lengths."""
-    from psdr_jit import integrators, scene_io
-
-    named = args.integrator or integrators.DEFAULT_INTEGRATOR
-    own = scene_io.integrator_properties(args.scene, **_common.definitions(args))
-    given: Mapping[str, Any] | str = own if own.get("type") == named else named
-    return integrators.integrator_spec(scene, given, max_depth=args.max_depth)
 
 
 def describe(result: Any, exr: Path, png: Path) -> str:

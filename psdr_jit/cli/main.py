@@ -38,6 +38,7 @@ COMMANDS = {
     "gradient": Command(
         "psdr_jit.cli.gradient", "differentiate a scene by one of its parameters", renders=True
     ),
+    "plan": Command("psdr_jit.cli.plan", "show what differentiating a scene would compute, and why", renders=True),
     "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
     "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),
     "doctor": Command("psdr_jit.cli.doctor", "check Python, Mitsuba, Dr.Jit and LLVM", renders=False),
@@ -49,7 +50,7 @@ PASSED_ON = ("bench", "test")  # commands whose options are not ours to know
 
 def build_parser(wanted: str | None) -> argparse.ArgumentParser:
     """The parser; only the subcommand `wanted` gets its arguments."""
-    parser = argparse.ArgumentParser(prog="psdr", description=psdr_jit.__doc__)
+    parser = argparse.ArgumentParser(prog="psdr", description=psdr_jit.__doc__.splitlines()[0])
     parser.add_argument("--version", action="version", version=f"psdr_jit {psdr_jit.__version__}")
     parser.epilog = f"{TRACEBACK_VARIABLE}=1 shows the Python traceback of an error."
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

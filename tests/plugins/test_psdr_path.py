@@ -14,7 +14,7 @@ from helpers import adjoint_identity, load, motion_of, spec_of
 from problems import Problem, named
 
 from psdr_jit import integrators, scene_io
-from psdr_jit.errors import OptionError, UnsupportedError
+from psdr_jit.errors import OptionError, UnsupportedError, ZeroDerivativeWarning
 
 SIZE = {"res": 16}
 BOX = Problem("lit_box", "box.vertex_positions", 0.0, direction=(1, 0, 0))
@@ -94,7 +94,8 @@ def test_all_terms_off_is_an_error(llvm):
 
 def test_depth_zero_is_black(llvm):
     card = Problem("emissive_card", "card.vertex_positions", 0.0, direction=(1, 0, 0))
-    image = derivative(load(card, **SIZE), mi.load_dict({"type": "psdr_path", "max_depth": 0}), problem=card)
+    with pytest.warns(ZeroDerivativeWarning, match="max_depth = 0"):
+        image = derivative(load(card, **SIZE), mi.load_dict({"type": "psdr_path", "max_depth": 0}), problem=card)
     assert image.shape == (16, 16, 3) and not image.any()
 
 

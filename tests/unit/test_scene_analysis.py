@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from psdr_jit import compat
-from psdr_jit.errors import ParameterError, SceneError, UnsupportedError, UnsupportedWarning
+from psdr_jit.errors import SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
 from psdr_jit.mesh_edges import build_edge_topology
 from psdr_jit.scene_analysis import analyse
 from psdr_jit.scene_checks import findings, require_supported, warn_about_mesh
@@ -125,7 +125,7 @@ def test_enabled_parameters_are_found_once_and_in_their_place(parameter, where):
 def test_nothing_enabled():
     facts = analyse(load())
     assert not facts.anything_enabled and not facts.geometry_moves
-    with pytest.raises(ParameterError, match=r"dr\.enable_grad"):
+    with pytest.warns(ZeroDerivativeWarning, match=r"dr\.enable_grad"):
         require_supported(facts)
 
 

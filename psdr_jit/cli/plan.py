@@ -1,0 +1,35 @@
+"""Show what differentiating a scene would compute: terms, edges, samples and form, with the reasons.
+
+No ray is traced. Reads: 'psdr plan SCENE.xml --wrt box.vertex_positions --wrt lamp.position'.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from psdr_jit.cli import _common
+
+NAME = "plan"
+HELP = "show what differentiating a scene would compute, and why"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    _common.add_scene_arguments(parser)
+    parser.add_argument("--wrt", action="append", default=[], metavar="PARAM",
+                        help="parameter to differentiate by, may be repeated; 'psdr params' lists them")
+    parser.add_argument("--spp", type=int, metavar="N", help="samples per pixel (default: the scene's own)")
+    parser.add_argument("--max-depth", type=int, metavar="N", help="path length (default: the scene's own)")
+    parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table; 0."""
+    _common.require_positive(spp=args.spp, max_depth=args.max_depth)
+    from psdr_jit import scene_io
+    from psdr_jit.planning import make_plan
+
+    scene_io.use_variant(args.variant)
+    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene_io.check_sensor(scene, args.sensor)
+    print(make_plan(scene, args.wrt, args.sensor, _common.integrator_of(args, scene), args.spp or 0))
+    return 0
