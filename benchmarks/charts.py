@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import accuracy, cases, references
+from benchmarks import accuracy, cases, references, tables
 from benchmarks import cost as cost_suite
 from benchmarks import stability as stability_suite
+from benchmarks.planning import AUTO, EQUAL_BUDGETS, MATERIAL, SPATIAL
 
 DPI = 200
 INK, LIGHT = "0.15", "0.75"
@@ -40,8 +41,10 @@ GAIN_LIMITS = (-0.1, 2.1)  # of the axis; what lies outside is drawn at its edge
 RATIOS = (
     "best prb_projective / psdr_path\n"
     "filled circle: variance × seconds; open circle: the same where the peer misses more than half\n"
-    "of the derivative or doubles it; diamond: mean squared error after 10 s"
+    "of the derivative or doubles it; diamond: mean squared error after 10 s; square: ours against ours with equal\n"
+    "budgets in the spatial form, geometric mean of the scenes (ticks)"
 )
+FORM_MARKERS = {SPATIAL: ("s", "#c1272d", "none"), MATERIAL: ("^", "#2a7f9e", "none"), AUTO: (".", "black", "black")}
 TARGET, LEAST = 50, 5  # ratios of variance × seconds that the project wants on average and everywhere
 
 
@@ -120,17 +123,43 @@ def error_against_time(rows: list[dict[str, Any]], path: Path) -> Path:
     return save(figure, path)
 
 
-def ratios(summary: list[dict[str, Any]], path: Path) -> Path:
-    """How much better than the best `prb_projective` each case is, in variance × seconds and in error after 10 s."""
-    figure, (axis,) = panels(1, 0.22 * len(summary) + 1.2)
+def forms(found: list[dict[str, Any]], path: Path) -> Path | None:
+    """Variance × seconds of each form relative to equal budgets in the spatial form, per scene."""
+    if not found:
+        return None
+    figure, (axis,) = panels(1, 0.17 * len(found) + 1.2)
     figure.set_figwidth(7)
+    heights = np.arange(len(found))[::-1]
+    for name, (marker, colour, fill) in FORM_MARKERS.items():
+        x = [f["rows"][name]["cost"] / f["rows"][EQUAL_BUDGETS]["cost"] for f in found]
+        axis.plot(x, heights, marker, color=colour, markersize=4, markerfacecolor=fill, label=name)
+    axis.axvline(1, color=LIGHT, linewidth=0.7)
+    axis.set(xscale="log", yticks=heights)
+    axis.set_yticklabels([f["case"] for f in found])
+    axis.set_xlabel("variance × seconds, relative to the spatial form with equal budgets", fontsize=7)
+    axis.legend(fontsize=7, frameon=False, loc="lower right")
+    figure.tight_layout()
+    return save(figure, path)
+
+
+def ratios(summary: list[dict[str, Any]], path: Path, forms_found: Sequence[dict[str, Any]] = ()) -> Path:
+    """How much better than the best `prb_projective` each case is, in variance × seconds and in error after 10 s.
+
+    Below them, how much automatic budgets and forms win over equal budgets in the spatial form.
+    """
+    gains = tables.gains_of_plans(forms_found)
+    figure, (axis,) = panels(1, 0.22 * (len(summary) + len(gains)) + 1.2)
+    figure.set_figwidth(7)
+    for k, (_, values) in enumerate(gains):
+        axis.plot(values, [-1 - k] * len(values), "|", color="#2a7f9e", markersize=5, markeredgewidth=0.6)
+        axis.plot([tables.geometric_mean(values)], [-1 - k], "s", color="black", markersize=4)
     heights = np.arange(len(summary))[::-1]
     for height, line in zip(heights, summary, strict=True):
         axis.plot([line["cost_ratio"]], [height], "o", color="black", markersize=4,
                   markerfacecolor="black" if line["does_it"] else "white")
         axis.plot([line["mse_ratio"]], [height], "D", color="#c1272d", markersize=4, markerfacecolor="none")
-    axis.set(xscale="log", yticks=heights)
-    axis.set_yticklabels([line["case"] for line in summary])
+    axis.set(xscale="log", yticks=[*heights, *(-1 - k for k in range(len(gains)))])
+    axis.set_yticklabels([*(line["case"] for line in summary), *(label for label, _ in gains)])
     for x, text in ((1, "equal"), (LEAST, f"{LEAST}x"), (TARGET, f"{TARGET}x")):
         axis.axvline(x, color=LIGHT, linewidth=0.7)
         axis.text(x, len(summary) - 0.4, text, fontsize=6, ha="center", color=INK)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 REFERENCE = "reference"  # the method that others are compared with: it runs first, and always
-SUITES = ("accuracy", "stability", "cost")
+SUITES = ("accuracy", "stability", "cost", "planning")
 
 
 @dataclass(frozen=True)

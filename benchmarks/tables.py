@@ -51,6 +51,17 @@ def summary(rows: list[Row]) -> list[dict[str, Any]]:
     return found
 
 
+def gains_of_plans(forms: Iterable[dict[str, Any]]) -> list[tuple[str, list[float]]]:
+    """What automatic budgets and forms win over equal budgets in the spatial form: `[(label, ratio per scene)]`."""
+    found = list(forms)
+    if not found:
+        return []
+    equal = [f["rows"]["spatial, equal budgets"]["cost"] for f in found]
+    label = {"spatial": "automatic budgets", "material": "material form", "auto": "auto form and budgets"}
+    return [(text, [e / f["rows"][name]["cost"] for e, f in zip(equal, found, strict=True)])
+            for name, text in label.items()]  # fmt: skip
+
+
 def summary_table(lines: list[dict[str, Any]]) -> str:
     def cells(line: dict[str, Any]) -> list[str]:
         ours, peer = line["ours"], line["closest"]

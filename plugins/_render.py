@@ -10,7 +10,7 @@ from psdr_jit import film as films
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
 from psdr_jit.plan import Plan
-from psdr_jit.planning import Call, prepare
+from psdr_jit.planning import Call, Prepared, prepare
 from psdr_jit.rejected import Rejected
 from psdr_jit.scene_io import find_sensor
 
@@ -41,19 +41,21 @@ class TermIntegrator(ADIntegrator):
         sensor = find_sensor(scene, sensor)
         return Call(self, scene, sensor, self.options, self.cache, self.stats["rejected"], seed, spp, mode)
 
-    def _jobs(self, scene, sensor, seed, spp, mode):
-        self.plan, jobs = prepare(self.call(scene, sensor, seed, spp, mode))
-        return jobs
+    def _prepared(self, scene, sensor, seed, spp, mode) -> Prepared:
+        prepared = prepare(self.call(scene, sensor, seed, spp, mode))
+        self.plan = prepared.plan
+        return prepared
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-        jobs = self._jobs(scene, sensor, seed, spp, "forward")
-        images = [term.forward(job) for term, job in jobs] or [films.black(find_sensor(scene, sensor).film())]
-        return sum(images[1:], images[0])
+        prepared = self._prepared(scene, sensor, seed, spp, "forward")
+        images = {term.name: term.forward(job) for term, job in prepared.jobs}
+        prepared.observe(seed, images)
+        return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-        jobs = self._jobs(scene, sensor, seed, spp, "backward")
+        prepared = self._prepared(scene, sensor, seed, spp, "backward")
         _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
-        for term, job in jobs:
+        for term, job in prepared.jobs:
             term.backward(job, grad_in)
         dr.eval()
 

@@ -32,6 +32,7 @@ import mitsuba as mi
 from .ad import tangents
 from .path_records import PathRecords
 from .records import Arrival, Hit, Vertex
+from .trial import STILL, Shift, Trial
 
 
 @dataclass
@@ -51,9 +52,10 @@ class SceneTraits:
     delta_lobes: bool  # only together with static geometry, see `scene_checks`
     moves: bool  # geometry, a light's pose or the camera depend on θ; otherwise the paths themselves are constants
     form: str = "spatial"  # what vertices do from the second on: slide along their rays, or stay on their material
+    trial: Trial | None = None  # motion that takes the place of the scene's own
 
 
-def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, active: mi.Bool):
+def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, shift: Shift, active: mi.Bool):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
     `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
@@ -61,6 +63,7 @@ def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, active: mi.Bool):
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
     si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    shift.segment_end(si, hit)
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
@@ -71,9 +74,9 @@ def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, active: mi.Bool):
     return si, ω, dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
 
 
-def emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, active: mi.Bool):
+def _emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, shift: Shift, active: mi.Bool):
     """Emission of the material point `hit` towards the attached point `x`: `(ω, L_e · measure)`, both attached."""
-    si, ω, measure = _material_segment(x, hit, wavelengths, active)
+    si, ω, measure = _material_segment(x, hit, wavelengths, shift, active)
     return ω, emitter.eval(si, active) * measure
 
 
@@ -91,14 +94,16 @@ def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
     return dr.select(on_mesh, dr.norm(dr.cross(p1 - p0, p2 - p0)), area)
 
 
-def _next_event(si, bsdf, nee, traits: SceneTraits):
+def _next_event(si, bsdf, nee, traits: SceneTraits, shift: Shift):
     """Scattered emitter sample, attached: f(ω) · value · weight."""
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
-    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, active)
+    ω, value = _emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, shift, active)
     if traits.delta_emitters:
         is_delta = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
-        ds, value_delta = emitter.sample_direction(si, mi.Point2f(0.5), is_delta)
+        seen = mi.SurfaceInteraction3f(si)
+        seen.p = seen.p - shift.of_lights()
+        ds, value_delta = emitter.sample_direction(seen, mi.Point2f(0.5), is_delta)
         ω = dr.select(is_delta, ds.d, ω)
         value = dr.select(is_delta, value_delta, value)
     f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
@@ -134,7 +139,9 @@ def _terms_of_resting(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: 
     return VertexTerms(si.p, L, w)
 
 
-def _terms_on_material(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits):
+def _terms_on_material(
+    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, shift: Shift
+):
     """`vertex_terms` in material form: every vertex but the first stays where it is on its surface.
 
     `ray` starts at the attached predecessor. Seen from there the vertex is met by a ray that moves along with it, so
@@ -145,17 +152,18 @@ def _terms_on_material(scene: mi.Scene, vertex: Vertex, following: Arrival, ray:
     resting = mi.Ray3f(vertex.hit.o, vertex.hit.d, 0, ray.wavelengths)
     material = pi.compute_surface_interaction(resting, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, pi.is_valid()).p
     along = mi.Ray3f(ray)
+    material = material + shift.at(material, vertex.hit.shape)
     along.o = dr.select(first, ray.o, dr.replace_grad(vertex.hit.o, material))
     along.d = dr.select(first, ray.d, vertex.hit.d)
-    si = pi.compute_surface_interaction(along, mi.RayFlags.All)
+    si = shift.surface(vertex.hit, along, mi.RayFlags.All)
     arrival = dr.replace_grad(vertex.hit.d, dr.normalize(si.p - ray.o))
     si.wi = dr.select(first | ~si.is_valid(), si.wi, si.to_local(-arrival))
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
     bsdf = si.bsdf()
-    L += _next_event(si, bsdf, vertex.nee, traits)
+    L += _next_event(si, bsdf, vertex.nee, traits, shift)
 
     goes_on = vertex.inv_pdf != 0
-    onward, ω, measure = _material_segment(si.p, following.hit, si.wavelengths, goes_on)
+    onward, ω, measure = _material_segment(si.p, following.hit, si.wavelengths, shift, goes_on)
     w = bsdf.eval(ctx, si, si.to_local(ω), goes_on) * measure * dr.abs(vertex.inv_pdf)
     emitter = dr.select(onward.is_valid(), onward.shape.emitter(), scene.environment())
     emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
@@ -168,18 +176,20 @@ def _throughput_ratio(vertex: Vertex, following: Arrival) -> mi.Spectrum:
     return dr.select(vertex.β != 0, following.β / vertex.β, 0)
 
 
-def vertex_terms(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits):
+def vertex_terms(
+    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, shift: Shift
+):
     """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
     if not traits.moves:
         return _terms_of_resting(scene, vertex, following, ray, traits)
     if traits.form == "material":
-        return _terms_on_material(scene, vertex, following, ray, first, traits)
+        return _terms_on_material(scene, vertex, following, ray, first, traits, shift)
     ctx = mi.BSDFContext()
-    si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
+    si = shift.surface(vertex.hit, ray, mi.RayFlags.All)
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
 
     bsdf = si.bsdf()
-    L += _next_event(si, bsdf, vertex.nee, traits)
+    L += _next_event(si, bsdf, vertex.nee, traits, shift)
 
     goes_on = vertex.inv_pdf != 0
     inv_pdf = dr.abs(vertex.inv_pdf)
@@ -188,13 +198,18 @@ def vertex_terms(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ra
     found = following.hit.intersection()
     emitter = dr.select(found.is_valid(), found.shape.emitter(), scene.environment())
     emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
-    ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, emits)
+    ω, value = _emission_towards(si.p, following.hit, si.wavelengths, emitter, shift, emits)
     w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
     if traits.delta_lobes:
         is_delta, ratio = vertex.inv_pdf < 0, _throughput_ratio(vertex, following)
         w, w_emission = dr.select(is_delta, ratio, w), dr.select(is_delta, ratio, w_emission)
     L += dr.select(emits, w_emission * value * following.weight_emission, 0)
     return VertexTerms(si.p, L, w)
+
+
+def _resumed(trial: Trial | None, *variables):
+    """Gradients of everything, or in a trial of these variables alone."""
+    return dr.resume_grad() if trial is None else dr.resume_grad(*variables)
 
 
 @dr.syntax
@@ -216,7 +231,7 @@ def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, trai
             o = mi.Point3f(v.hit.o)
             d = mi.Vector3f(v.hit.d)
             dr.enable_grad(o, d)
-            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits)
+            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits, STILL)
             Lo = t.L + t.w * rest
             dr.backward_from(dr.sum(δL * v.β * Lo) + dr.dot(λ_o, t.x))
             λ_o = mi.Vector3f(dr.grad(o))
@@ -238,13 +253,18 @@ def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits:
     while dr.hint(active, label="psdr.interior.forward", exclude=[traits]):
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & (v.inv_pdf != 0))
+        o, d = mi.Point3f(v.hit.o), mi.Vector3f(v.hit.d)
+        shift, turn = mi.Vector3f(0), mi.Vector3f(0)
         with dr.resume_grad():
-            o = mi.Point3f(v.hit.o)
-            d = mi.Vector3f(v.hit.d)
-            dr.enable_grad(o, d)
+            dr.enable_grad(o, d, shift, turn)
+        with _resumed(traits.trial, o, d, shift, turn):
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits)
+            if dr.hint(traits.trial is not None, mode="scalar"):
+                dr.set_grad(shift, traits.trial.shift)
+                dr.set_grad(turn, traits.trial.turn)
+            ray = mi.Ray3f(o, d, 0, records.wavelengths)
+            t = vertex_terms(scene, v, following, ray, k == 0, traits, Shift(traits.trial, shift, turn))
             # x is an input of L: keep the gradients of interior nodes until they have been read
             L_grad, w_grad, x_grad = tangents(t.L, t.w, t.x)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad

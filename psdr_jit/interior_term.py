@@ -24,6 +24,7 @@ from .path_steps import PathLimits, first_hit, walk
 from .scattering import UNIFORM_SHARE
 from .streams import Stream, stream_seed
 from .touch import count_vertices, touches
+from .trial import registry_table
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
@@ -80,12 +81,8 @@ def every_path_differs(job: Job) -> bool:
 
 def touch_table(job: Job) -> mi.UInt32:
     """By shape registry index: 1 if scattering there depends on an enabled parameter."""
-    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, job.scene.shapes_dr())]
-    table = [0] * (max(ids, default=0) + 1)
-    for shape in job.facts.shapes:
-        if shape.index >= 0 and (shape.geometry or shape.shading or shape.material):
-            table[ids[shape.index]] = 1
-    return mi.UInt32(table)
+    shapes = job.facts.shapes
+    return registry_table(job.scene, {s.index for s in shapes if s.geometry or s.shading or s.material})
 
 
 def only_materials(job: Job) -> bool:
@@ -150,7 +147,7 @@ def _traits(job: Job) -> SceneTraits:
     facts = job.facts
     delta_lobes = any(s.delta_lobes for s in facts.shapes)
     moves = facts.geometry_moves or not job.plan.prunes
-    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form)
+    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form, job.trial)
 
 
 def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
@@ -169,7 +166,9 @@ def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
     dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
     if dr.width(lane) > 0:
         o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-        if job.facts.camera_moves:
+        if job.facts.camera_moves and job.trial is not None:
+            o_grad, d_grad = job.trial.velocity(p.ray.o), dr.cross(job.trial.turn, p.ray.d)
+        elif job.facts.camera_moves:
             with dr.resume_grad():
                 o_grad, d_grad = tangents(p.ray.o, p.ray.d)
             o_grad = o_grad + _skipped(job, p, records) * d_grad

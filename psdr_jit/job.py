@@ -12,6 +12,7 @@ from .path_steps import PathLimits
 from .plan import Plan
 from .rejected import Rejected
 from .scene_analysis import SceneFacts
+from .trial import Trial
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Job:
     rejected: Rejected  # the integrator's: counts dropped samples
     seed: int | mi.UInt32
     spp: int
+    trial: Trial | None = None  # motion that takes the place of the scene's own (forward mode only)
 
     @property
     def film(self) -> mi.Film:

@@ -88,6 +88,11 @@ class Options:
         return self.sppi if value is None and name == "sppd" else value
 
     @property
+    def budgets_set(self) -> bool:
+        """Does any term have a budget of its own?"""
+        return any(getattr(self, name) is not None for name in ("sppc", "sppp", "sppi", "sppd"))
+
+    @property
     def depth_limit(self) -> int:
         """`max_depth` with -1 replaced by Mitsuba's largest depth."""
         return UNLIMITED if self.max_depth == -1 else self.max_depth

@@ -14,6 +14,8 @@ from .options import Options
 from .scene_analysis import SceneFacts
 from .streams import Stream
 
+SWITCHED_OFF = "switched off by its budget"
+
 #: Segments of a path that count when its cost is estimated: deeper ones are rare or dim.
 TYPICAL_DEPTH = 5
 
@@ -98,7 +100,7 @@ def make(
     terms = []
     for name, (runs, reason) in needed.items():
         if spp[name] == 0 and runs:
-            runs, reason = False, "switched off by its budget"
+            runs, reason = False, SWITCHED_OFF
         depth = min(options.depth_limit, TYPICAL_DEPTH)
         count = spp[name] if runs else 0
         streams = tuple(stream.name for stream in STREAMS[name]) if runs else ()

@@ -7,28 +7,33 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import pilot
 from . import plan as plans
 from .boundary.edges import scene_edges
 from .convexity import lone_convex
 from .errors import OptionError, ZeroDerivativeWarning
 from .film import require_film
+from .forms import forms_to_try
 from .integrators import build, integrator_spec
 from .job import Job
+from .noise_log import NoiseLog
 from .options import Options, require_runtime, samples_per_pixel
 from .params import also_enabled
+from .pilot import Measurement
 from .plan import EdgeCount, Geometry, Plan
 from .rejected import Rejected
 from .scene_analysis import SceneFacts, analyse
 from .scene_checks import require_supported, warn_about_missing_terms
 from .scene_io import find_sensor
 from .terms import TERMS, Term
+from .trial import trial_of
 from .velocities import facts_along_tangents
 
 #: Why edges are left out of a term's distribution.
@@ -54,8 +59,22 @@ class Call:
     mode: str = "forward"  # or "backward"
 
 
-def prepare(call: Call) -> tuple[Plan, list[tuple[Term, Job]]]:
-    """What has to run: the plan, and a job for each of its running terms. Raises typed errors before any ray."""
+@dataclass(frozen=True)
+class Prepared:
+    """What has to run: the plan, and a job for each of its running terms."""
+
+    plan: Plan
+    jobs: list[tuple[Term, Job]]
+    log: NoiseLog | None  # wants to see the derivative images of forward mode
+
+    def observe(self, seed: object, images: Mapping[str, mi.TensorXf]) -> None:
+        """Hand over the images of all terms."""
+        if self.log is not None:
+            self.log.observe(self.plan.form, seed, {t.name: t.spp for t in self.plan.terms}, images)
+
+
+def prepare(call: Call) -> Prepared:
+    """Raises typed errors before any ray is traced."""
     film = call.sensor.film()
     require_film(film)
     budgets = _budgets(call)
@@ -63,11 +82,12 @@ def prepare(call: Call) -> tuple[Plan, list[tuple[Term, Job]]]:
     facts = _facts(call)
     require_supported(facts)
     warn_about_missing_terms(facts, [term.name for term in TERMS], call.options.depth_limit, call.cache)
-    plan = _plan(call, facts, budgets)
-    if not plan.running and facts.anything_enabled:
+    shared: dict = {}
+    plan, log = _plan(call, facts, budgets, shared)
+    switched_off = any(term.reason == plans.SWITCHED_OFF for term in plan.terms)
+    if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=4)
-    shared: dict = {}
     jobs = [
         (term, Job(
             call.integrator, call.scene, call.sensor, facts, call.options, plan, call.cache, shared, call.rejected,
@@ -75,7 +95,7 @@ def prepare(call: Call) -> tuple[Plan, list[tuple[Term, Job]]]:
         ))
         for term in TERMS if plan.term(term.name).runs
     ]  # fmt: skip
-    return plan, jobs
+    return Prepared(plan, jobs, log)
 
 
 def _facts(call: Call) -> SceneFacts:
@@ -97,14 +117,58 @@ def _budgets(call: Call) -> dict[str, int]:
     return budgets
 
 
-def _plan(call: Call, facts: SceneFacts, budgets: Mapping[str, int]) -> Plan:
+def _plan(call: Call, facts: SceneFacts, budgets: Mapping[str, int], shared: dict) -> tuple[Plan, NoiseLog | None]:
+    """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     geometry = Geometry()
     if facts.geometry_moves and call.options.plan == "lean":
         geometry = Geometry(lone_convex(call.scene, call.sensor, facts, call.cache))
-    form = (call.options.form, "as asked for")
-    if call.options.form == "auto":
-        form = ("spatial", "the default")
-    return plans.make(facts, call.options, geometry, budgets, form, "equal")
+    forms, reason = forms_to_try(call.scene, facts, call.options)
+    plan = plans.make(facts, call.options, geometry, budgets, (forms[0], reason), "equal")
+    automatic = len(plan.running) > 1 and call.options.plan == "lean" and not call.options.budgets_set
+    if len(forms) == 1 and not automatic:
+        return plan, None
+    log = _noise_log(call, facts, plan, forms, tuple(budgets.values()))
+    if log.needs_pilot and not dr.flag(dr.JitFlag.FreezingScope):  # which records, but must not read back
+        log.pilot(_run_pilot(call, facts, plan, forms, shared))
+    if log.current is not None and log.due:
+        log.learn()
+        log.plan = _chosen(call, facts, geometry, budgets, log.current, automatic, (forms[0], reason))
+    log.calls += 1
+    return log.plan or plan, log
+
+
+def _noise_log(call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], budgets: tuple[int, ...]) -> NoiseLog:
+    names = tuple(term.name for term in plan.running)
+    film = tuple(call.sensor.film().crop_size())
+    key = ("noise", facts.enabled, facts.sensor.name, film, call.options, forms, names, budgets)
+    return call.cache.setdefault(key, NoiseLog())
+
+
+def _run_pilot(call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], shared: dict) -> Measurement:
+    trial = trial_of(call.scene, facts)
+
+    def job_of(form: str, seed: int, spp: int) -> Job:
+        return Job(
+            call.integrator, call.scene, call.sensor, facts, call.options, replace(plan, form=form), call.cache,
+            shared, Rejected(), seed, spp, trial,
+        )  # fmt: skip
+
+    names = [term.name for term in plan.running]
+    return pilot.measure(job_of, forms, names, call.scene.environment() is not None)
+
+
+def _chosen(
+    call: Call, facts: SceneFacts, geometry: Geometry, budgets: Mapping[str, int], noise: Measurement, automatic: bool,
+    form: tuple[str, str],
+) -> Plan:  # fmt: skip
+    """The plan with the least variance × cost. `form`: if there is no choice."""
+    choices = {f: noise.allocate(f, budgets) if automatic else dict(budgets) for f in noise.noise}
+    work = {f: noise.efficiency(f, choices[f]) for f in choices}
+    best, worst = min(work, key=work.get), max(work, key=work.get)
+    if len(work) > 1 and work[best] > 0:
+        form = (best, f"{work[worst] / work[best]:.2g} times less variance x cost than {worst}, by a pilot")
+    why = "by measured noise, as costly as equal ones" if automatic else "equal"
+    return plans.make(facts, call.options, geometry, choices[form[0]], form, why)
 
 
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
@@ -122,9 +186,9 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
         raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path")
     names = [] if params is None or isinstance(params, mi.SceneParameters) else list(params)
     with also_enabled(scene, names):
-        plan, jobs = prepare(integrator.call(scene, view, 0, spp))
-        counts = {term.name: _count(term, job) for term, job in jobs if term.weights is not None}
-    return plans.with_edges(plan, counts)
+        prepared = prepare(integrator.call(scene, view, 0, spp))
+        counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.weights is not None}
+    return plans.with_edges(prepared.plan, counts)
 
 
 def _count(term: Term, job: Job) -> EdgeCount:

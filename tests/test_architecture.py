@@ -25,18 +25,19 @@ RANK = {
     "params": 2, "scene_probes": 3,
     "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
     "intersections": 2, "material_tangents": 2, "perturbation": 3, "llvm": 2,
-    "scene_analysis": 4, "interior": 3, "drjit_libraries": 3,
-    "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "job": 6,
+    "scene_analysis": 4, "interior": 6, "drjit_libraries": 3,
+    "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "forms": 5, "trial": 5,
+    "job": 6,
     "edge_rows": 2, "junctions": 6, "junction_points": 7, "shape_pairs": 3,
     "edge_set": 7,
     # estimators
     "boundary": 8, "interior_term": 8,
     "terms": 9,
     # plugins and the tools on top of them
-    "integrators": 10, "planning": 11, "plugins": 12,
-    "gradient": 13, "finite_differences": 13,
-    "check": 14, "demo": 14,
-    "cli": 15,
+    "pilot": 10, "noise_log": 11, "integrators": 10, "planning": 12, "plugins": 13,
+    "gradient": 14, "finite_differences": 14,
+    "check": 15, "demo": 15,
+    "cli": 16,
 }  # fmt: skip
 """Stage of each module or package; an import must lead to a lower one, or stay within a package."""
 

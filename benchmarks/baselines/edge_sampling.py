@@ -51,6 +51,7 @@ from psdr_jit.interior_term import _camera_passes
 from psdr_jit.job import Job
 from psdr_jit.low_discrepancy import pixel_sampler
 from psdr_jit.path_steps import SHADOW_EPSILON, NoSink, continue_path, first_hit, walk
+from psdr_jit.planning import prepare
 from psdr_jit.records import Hit
 from psdr_jit.scene_analysis import SceneFacts
 from psdr_jit.sensor_frame import View
@@ -68,7 +69,7 @@ class EdgeSampling:
 
     def __init__(self, max_depth: int = -1, rr_depth: int = 5, hide_emitters: bool = False):
         limits = {"max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
-        self._others = mi.load_dict({"type": "psdr_path", "sppd": 0, "sppi": 0, **limits})
+        self._others = mi.load_dict({"type": "psdr_path", "form": "spatial", "sppd": 0, "sppi": 0, **limits})
 
     @property
     def stats(self) -> dict:
@@ -76,7 +77,7 @@ class EdgeSampling:
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> mi.TensorXf:
         """Derivative image along the tangents set on the scene's parameters. Detached."""
-        jobs = self._others.jobs(scene, sensor, seed, spp)
+        jobs = prepare(self._others.call(scene, sensor, seed, spp)).jobs
         for _, job in jobs:
             require_supported(job.facts)
         images = [term.forward(job) for term, job in jobs]

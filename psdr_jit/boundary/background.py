@@ -120,4 +120,7 @@ def prepared(job: Job) -> BoundarySamples | None:
         records=records,
         value=value,
         source_motion=lambda: _source_motion(b),
+        x=v.x,
+        source=b.source,
+        source_covector=-b.ratio * v.side,
     )

@@ -198,6 +198,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
         records=records,
         value=records.data.W,
         source_motion=lambda: source_motion(job, segment),
+        x=segment.x,
+        source=segment.source,
+        source_covector=-segment.ratio * segment.n,
     )
 
 

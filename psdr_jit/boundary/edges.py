@@ -171,6 +171,18 @@ def compact(record, active: mi.Bool):
     return dr.gather(type(record), record, dr.compress(active))
 
 
+def row_moves(table: EdgeTable, row: mi.UInt32) -> mi.Bool:
+    """Can these edges move?"""
+    straight = row < table.segment_count
+    moves = mi.Bool(False)
+    if table.has_segments:
+        moves |= dr.gather(mi.Bool, table.segments.rows.moves, row, straight)
+    if table.has_curves:
+        shape = dr.gather(mi.UInt32, table.curves.rows.shape, row - table.segment_count, ~straight)
+        moves |= dr.gather(mi.UInt32, table.curve_moves, shape, ~straight) != 0
+    return moves
+
+
 def edge_motion(table: EdgeTable, row: mi.UInt32, t: mi.Float, local: mi.Point3f) -> mi.Vector3f:
     """Vector of value 0 whose derivative is the material velocity of the edge point, attached.
 

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..job import Job
+from ..records import Hit
 from ..streams import Stream
 from . import background, secondary
 from .edge_directions import wedge_measure, wedges
@@ -94,6 +95,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
         records=records,
         value=value,
         source_motion=lambda: mi.Float(0),
+        x=view.x,
+        source=Hit.made(dr.zeros, 1),
+        source_covector=mi.Vector3f(0),
     )
 
 

@@ -36,7 +36,17 @@ from .edge_points import (
     curve_row_point,
     segment_point,
 )
-from .edges import EdgeTable, compact, distribution_of, edge_motion, edge_samples, scene_edges, shared_frame, sides
+from .edges import (
+    EdgeTable,
+    compact,
+    distribution_of,
+    edge_motion,
+    edge_samples,
+    row_moves,
+    scene_edges,
+    shared_frame,
+    sides,
+)
 
 
 @dataclass(frozen=True)
@@ -152,7 +162,10 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
 
 
 def contribution(job: Job) -> mi.TensorXf | None:
-    """The primary boundary as an image of value 0 that carries its derivative; None if no edge can move."""
+    """The primary boundary as an image of value 0 that carries its derivative; None if no edge can move.
+
+    In a trial the image is the derivative itself.
+    """
     frame = shared_frame(job)
     with dr.suspend_grad():
         edges = primary_edges(job, frame)
@@ -170,6 +183,10 @@ def contribution(job: Job) -> mi.TensorXf | None:
         point = seen.point
         scale = point.speed / point.view.J_px * sample.inv_pdf
 
+    if job.trial is not None:
+        moves = dr.select(row_moves(edges.table, sample.row), 1.0, 0.0) - float(job.trial.camera)
+        motion = dr.dot(point.side, job.trial.velocity(point.x)) * moves * scale
+        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
     with dr.resume_grad():
         relative = edge_motion(edges.table, sample.row, sample.t, seen.local)
         if job.facts.camera_moves:
@@ -186,7 +203,7 @@ def forward(job: Job) -> mi.TensorXf:
         image = contribution(job)
         if image is None:
             return films.black(job.film)
-        return tangents(image)
+        return tangents(image) if job.trial is None else image
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:

@@ -19,7 +19,9 @@ import mitsuba as mi
 from .. import film as films
 from ..ad import accumulate, backpropagate, tangents
 from ..job import Job, passes
-from .edges import EdgeTable, edge_motion
+from ..records import Hit
+from ..trial import Trial
+from .edges import EdgeTable, edge_motion, row_moves
 from .sensor_subpath import SubpathRecords
 
 
@@ -36,6 +38,9 @@ class BoundarySamples:
     records: SubpathRecords
     value: mi.Spectrum  # flat: splatted per unit of motion
     source_motion: Callable[[], mi.Float]  # attached, per lane, primal value 0
+    x: mi.Point3f  # x_B
+    source: Hit  # x_S; no shape: a light without one
+    source_covector: mi.Vector3f  # on its velocity
 
 
 Prepare = Callable[[Job], "BoundarySamples | None"]
@@ -65,6 +70,21 @@ def _motion(job: Job, s: BoundarySamples) -> _Motion:
         camera = dr.dot(c.camera, ray.o + depth * ray.d)
     zero = [value - dr.detach(value) for value in (connect, go_on, camera)]
     return _Motion(at_edge, *zero)
+
+
+def _trial_motion(trial: Trial, s: BoundarySamples) -> mi.Float:
+    """Velocity of every connection in a trial motion (flat). Detached."""
+    c = s.records.data
+    at_edge = trial.along(s.n, s.x, row_moves(s.table, s.row))
+    x_s = s.source.o + dr.select(s.source.shape != 0, s.source.t, 0) * s.source.d
+    at_edge += trial.along(s.source_covector, x_s, trial.takes_part(s.source.shape))
+    of_light = (s.source.shape == 0) & mi.Bool(trial.lights)  # shifted only: where it is, nobody says
+    at_edge += dr.select(of_light, dr.dot(s.source_covector, trial.shift), 0)
+    x, moves = c.hit.o + c.hit.t * c.hit.d, trial.takes_part(c.hit.shape)
+    go_on, connect = (trial.along(g, x, moves) for g in (c.deposit_continue, c.deposit_connect))
+    camera = trial.along(c.camera, x, mi.Bool(trial.camera))
+    dr.eval(at_edge, go_on)
+    return dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
 
 
 def _splat(job: Job, s: BoundarySamples, motion: mi.Float) -> mi.TensorXf:
@@ -102,6 +122,8 @@ def _derivative_image(job: Job, s: BoundarySamples | None) -> mi.TensorXf:
     """One pass of `forward`."""
     if s is None:
         return films.black(job.film)
+    if job.trial is not None:
+        return _splat(job, s, job.rejected.keep_finite(mi.Color1f(_trial_motion(job.trial, s))).x)
     with dr.resume_grad():
         m = _motion(job, s)
         grads = tangents(m.segment, m.connect, m.go_on, m.camera)

@@ -26,7 +26,7 @@ def motion_of(scene: str, param: str) -> Perturbation:
 
 
 def spec(max_depth: int, **budgets: int) -> dict:
-    return {"type": "psdr_path", "max_depth": max_depth, "rr_depth": 100, **budgets}
+    return {"type": "psdr_path", "form": "spatial", "max_depth": max_depth, "rr_depth": 100, **budgets}
 
 
 def sampled(motion: Perturbation, max_depth: int, seeds: int, spp: int) -> np.ndarray:

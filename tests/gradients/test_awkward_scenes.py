@@ -45,7 +45,7 @@ def white(two_sided: bool = False) -> dict:
 
 def term(name: str, depth: int, rr_depth: int = 1000) -> dict:
     budgets = {"sppc": 0, "sppp": 0, "sppd": 0, "sppi": 0, name: 1}
-    return {"type": "psdr_path", "max_depth": depth, "rr_depth": rr_depth, **budgets}
+    return {"type": "psdr_path", "form": "spatial", "max_depth": depth, "rr_depth": rr_depth, **budgets}
 
 
 def mean_of(motion, spec: dict, spp: int) -> tuple[float, float]:

@@ -79,7 +79,7 @@ def test_a_budget_of_zero_switches_a_term_off(variant):
     scene = load(BOX, **SIZE)
     full, interior, primary = (
         derivative(scene, integrators.build({"type": "psdr_path", "max_depth": 2, **off}))
-        for off in ({}, {"sppp": 0}, {"sppc": 0})
+        for off in ({"sppc": 1}, {"sppp": 0}, {"sppc": 0})  # any budget that is set ends automatic ones
     )
     assert np.abs(interior).max() > 0 and np.abs(primary).max() > 0
     assert np.allclose(full, interior + primary, rtol=1e-4, atol=1e-4 * np.abs(full).max())
@@ -102,7 +102,7 @@ def test_depth_zero_is_black(llvm):
 def test_budgets_without_runtime_spp(llvm):
     """spp = 0: a term's own budget counts, or else the sampler's."""
     scene = load(BOX, spp=3, **SIZE)
-    by_sampler = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2}), spp=0)
+    by_sampler = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2, "sppd": 3}), spp=0)
     explicit = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2, "sppc": 3, "sppp": 3}), spp=0)
     runtime = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2, "sppc": 9, "sppp": 1}), spp=3)
     other = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2, "sppp": 5}), spp=0)

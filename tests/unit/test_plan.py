@@ -52,7 +52,7 @@ def test_terms(llvm, case):
         plan = plan_of(name, param, depth=depth)
     assert {t.name for t in plan.running} == CASES[case]
     for term in plan.terms:
-        assert term.reason and (term.spp == 16) == term.runs and bool(term.streams) == term.runs
+        assert term.reason and (term.spp > 0) == term.runs and bool(term.streams) == term.runs
         assert term.name in str(plan) and term.reason in str(plan)
 
 

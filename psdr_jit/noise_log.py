@@ -1,0 +1,70 @@
+"""What is known of the noise of a kind of call, from its pilot and from the derivative images since.
+
+Images of successive calls in forward mode are independent samples of (nearly) the same derivative: half the square of
+their difference estimates the variance of either. Budgets follow from earlier calls only, so that every estimate stays
+unbiased, and change at call numbers that are powers of two only, so that a forward and a backward call in between draw
+the same samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+
+from .pilot import REFRESH, Measurement, variance_of_pair
+
+#: Pairs of images that are looked at in a row, and from then on one in so many calls.
+EAGER, SELDOM = 8, 16
+
+#: Least weight of a new observation: the scene changes as an optimisation goes on.
+FORGET = 0.2
+
+
+@dataclass
+class NoiseLog:
+    """Of one kind of call: same parameters, sensor, options."""
+
+    calls: int = 0
+    measured: Measurement | None = None  # by the pilot
+    current: Measurement | None = None  # with what was observed since
+    plan: object = None  # made from `current` when it was last due
+    pairs: int = 0
+    last: dict[str, tuple[int, int, mi.TensorXf]] = field(default_factory=dict)  # term: (seed, paths, image)
+    pending: list[tuple[str, str, int, mi.Float]] = field(default_factory=list)  # (form, term, paths, variance)
+
+    @property
+    def needs_pilot(self) -> bool:
+        return self.calls % REFRESH == 0
+
+    @property
+    def due(self) -> bool:
+        """Is this a call at which budgets may change?"""
+        return self.calls & (self.calls - 1) == 0
+
+    def pilot(self, measured: Measurement) -> None:
+        """Start again from a new pilot."""
+        self.measured = self.current = measured
+        self.pairs = 0
+
+    def observe(self, form: str, seed: object, paths: Mapping[str, int], images: Mapping[str, mi.TensorXf]) -> None:
+        """Compare the images of this call with those of the last one, if their seeds differ."""
+        if not isinstance(seed, int) or not (self.pairs < EAGER or self.calls % SELDOM < 2):
+            self.last.clear()
+            return
+        for name, image in images.items():
+            before = self.last.get(name)
+            if before is not None and before[0] != seed and before[1] == paths[name]:
+                self.pending.append((form, name, paths[name], variance_of_pair(image, before[2])))
+            self.last[name] = (seed, paths[name], image)
+
+    def learn(self) -> None:
+        """Let what was observed count."""
+        if not self.pending or self.current is None:
+            return
+        self.pairs += 1
+        weight = max(FORGET, 1 / self.pairs)
+        for form, name, n, variance in self.pending:
+            self.current = self.current.observed(form, name, float(variance[0]), n, weight)
+        self.pending.clear()
