@@ -27,6 +27,7 @@ RES, SPP = 64, 16
 WARM_UP = 9  # calls: kernels are compiled, and budgets have learned from eight pairs of images
 MIN_ROUNDS, MAX_ROUNDS = 8, 64
 BLOCK = 8  # [px]
+ROUNDING = 1e-5  # of float32 sums in another order, relative to the image
 EQUAL = {"sppc": SPP, "sppp": SPP, "sppi": SPP}
 
 ON, OFF = "plan on", "plan off"
@@ -203,8 +204,8 @@ def _difference(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     blocks = np.stack([block_means(x - y, BLOCK) for x, y in zip(a, b, strict=True)])
     error = blocks.std(axis=0, ddof=1) / np.sqrt(len(blocks))
     scale = np.sqrt(np.mean(b.mean(0) ** 2))
-    seen = error > 1e-6 * scale
-    z = blocks.mean(0)[seen] / error[seen]
+    seen = error > 0
+    z = blocks.mean(0)[seen] / np.maximum(error[seen], ROUNDING * scale)
     largest = float(np.abs(blocks.mean(0)).max() / scale) if scale > 0 else 0.0
     rms = float(np.sqrt(np.mean(z**2))) if z.size else 0.0
     return {"rms_z": rms, "max_z": float(np.abs(z).max()) if z.size else 0.0, "largest_difference": largest}

@@ -224,8 +224,8 @@ def walk(
                     shape=hit_em.shape,
                     prim_index=hit_em.prim_index,
                     prim_uv=hit_em.prim_uv,
-                    d=hit_em.d,
-                    t=hit_em.t,
+                    d=ds.d,  # of the vertex itself: the shadow ray starts a little off it
+                    t=ds.dist,
                     weight=dr.select(active_em, mis_em / ds.pdf, 0),
                 ),
                 inv_pdf=dr.select(alive, dr.select(bs.delta, -inv_survival, inv_survival) / bs.pdf, 0),
