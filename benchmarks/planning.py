@@ -25,7 +25,7 @@ from psdr_jit.statistics import block_means
 NAME = "planning"
 RES, SPP = 64, 16
 WARM_UP = 9  # calls: kernels are compiled, and budgets have learned from eight pairs of images
-MIN_ROUNDS, MAX_ROUNDS = 8, 64
+MIN_ROUNDS, MAX_ROUNDS = 16, 64
 BLOCK = 8  # [px]
 ROUNDING = 1e-5  # of float32 sums in another order, relative to the image
 EQUAL = {"sppc": SPP, "sppp": SPP, "sppi": SPP}
@@ -60,7 +60,8 @@ def _plans() -> list[Comparison]:
         Case("hidden light", "baffled_light", BLOCKER, 3, X),
         Case("direct light", "cbox", SMALL_BOX, 2, X, load=cases.FLOATING),
         Case("one box moves", "cbox", SMALL_BOX, 4, X, load=cases.FLOATING),
-        Case("camera", "cbox", "camera.to_world", 3, X),
+        Case("camera", "cbox", "sensor.to_world", 3, X),
+        Case("emission of a room", "cbox", "light.emitter.radiance.value", 4),
         Case("turning sky", "envmap_rotation", "sky.to_world", 3, rotate=Y),
     ]
     known = Case("one vertex, known direction", "many_occluders", "occluders.vertex_positions", 2, index=1)

@@ -14,7 +14,7 @@ def by_case(rows: list[Row], family: str) -> dict[str, dict[str, Row]]:
     """Case without its family -> method -> row."""
     found: dict[str, dict[str, Row]] = {}
     for row in rows:
-        if row["family"] == family and row["status"] == "ok":
+        if row["case"].startswith(f"{family}: ") and row["status"] == "ok":
             found.setdefault(row["case"].split(": ", 1)[1], {})[row["method"]] = row
     return found
 

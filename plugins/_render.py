@@ -23,7 +23,7 @@ class TermIntegrator(ADIntegrator):
         super().__init__(props)
         self.cache: dict = {}
         self.plan: Plan | None = None  # of the latest derivative
-        self.stats = {"rejected": Rejected()}
+        self.stats = {"rejected": Rejected(), "grazing": Rejected()}  # paths that were dropped, or cut short
         self._path = mi.load_dict(
             {
                 "type": "path",
@@ -39,7 +39,8 @@ class TermIntegrator(ADIntegrator):
     def call(self, scene, sensor, seed, spp, mode="forward") -> Call:
         """A render call of this integrator as data."""
         sensor = find_sensor(scene, sensor)
-        return Call(self, scene, sensor, self.options, self.cache, self.stats["rejected"], seed, spp, mode)
+        stats = self.stats
+        return Call(self, scene, sensor, self.options, self.cache, stats["rejected"], stats["grazing"], seed, spp, mode)
 
     def _prepared(self, scene, sensor, seed, spp, mode) -> Prepared:
         prepared = prepare(self.call(scene, sensor, seed, spp, mode))

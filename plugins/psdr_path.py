@@ -37,10 +37,21 @@ class PathSpaceIntegrator(TermIntegrator):
      * - record_mib
        - |int|
        - Memory for recorded paths in MiB; larger wavefronts run in several passes (Default: 1024)
+     * - form
+       - |string|
+       - What path vertices do while a parameter changes: `spatial` (slide along their rays), `material` (stay on their
+         surfaces) or `auto`, whichever suits the scene (Default: auto)
+     * - plan
+       - |string|
+       - `lean` leaves out what is certainly 0, `full` computes everything, for comparison (Default: lean)
+     * - direction
+       - |string|
+       - `known`, in forward mode only, leaves out what has velocity 0 as well (Default: any)
 
     Samples are paths: an edge sample of the primary and of the indirect term takes two, one on either side of the edge.
-    A budget of 0 switches its term off; otherwise the runtime `spp` overrides it, and where neither is given the
-    sampler's count is used, as in `prb_projective`.
+    With no budget set, the terms share the cost of `spp` paths each by their measured noise. With any set, as in
+    `prb_projective`: 0 switches a term off, the runtime `spp` overrides the others, and where neither is given the
+    sampler's count is used. The plan of the latest derivative is the attribute `plan`.
     """
 
 

@@ -23,8 +23,6 @@ def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[
         return ("spatial",), "nothing moves, so the forms are the same"
     if options.depth_limit < 3:
         return ("spatial",), "light is scattered once at most, so the forms are the same"
-    if not (facts.shapes_move or facts.emitters_move):
-        return ("material",), "only the camera moves: all but the first vertex of a path rest"
     touching = _touching(scene, facts)
     if touching:
         return ("spatial",), f"{touching} touch and move against each other"

@@ -113,7 +113,7 @@ def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
 
 def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
-    limits = _limits(job)
+    facts, limits = job.facts, _limits(job)
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
@@ -139,6 +139,8 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
     records.wavelengths = ray.wavelengths
+    if facts.geometry_moves:
+        job.grazing.count(records.cut())
     dr.eval(records.count, records.vertices)
     return records, lane
 

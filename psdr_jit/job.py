@@ -27,7 +27,8 @@ class Job:
     plan: Plan
     cache: dict  # the integrator's: edge sets that outlive a call
     shared: dict  # of all terms of one render call
-    rejected: Rejected  # the integrator's: counts dropped samples
+    rejected: Rejected  # the integrator's: counts samples that were not finite ...
+    grazing: Rejected  # ... and paths that end where they meet a surface edge-on
     seed: int | mi.UInt32
     spp: int
     trial: Trial | None = None  # motion that takes the place of the scene's own (forward mode only)

@@ -25,7 +25,8 @@ class Options:
     """How far to trace and how many samples to spend.
 
     Budgets count paths per pixel: an edge sample of the primary and indirect terms takes two, one for each side.
-    `None` for a budget means "not set": the runtime `spp`, or else the sampler's count, decides.
+    `None` for a budget means "not set": the runtime `spp`, or else the sampler's count, decides. While none is set,
+    these count for the terms on average, see `pilot`.
     """
 
     max_depth: int = -1  # path segments, -1: unlimited

@@ -8,6 +8,10 @@ import mitsuba as mi
 from .path_steps import NoSink, shadow_hit
 from .records import Arrival, EmitterSample, Hit, Vertex
 
+#: Cosine of arrival below which a vertex has no derivative. A sliding vertex moves by 1/cosθ, and at the outline of a
+#: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
+GRAZING = 5e-4
+
 
 class PathRecords:
     """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
@@ -25,6 +29,8 @@ class PathRecords:
         self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
         self.lane = dr.arange(mi.UInt32, lanes)
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
+        self.whole = dr.full(mi.UInt32, 0xFFFFFFFF, lanes)  # vertices before the first that is met edge-on
+        dr.make_opaque(self.whole)
         self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
         self.vertices = Vertex(
             hit=Hit.made(dr.empty, size),
@@ -46,7 +52,15 @@ class PathRecords:
         """Not needed: the sweeps add up radiance themselves."""
 
     def scattered(self, k: mi.UInt32, scatter, active: mi.Bool) -> None:
-        """Not needed: the sweeps evaluate materials again."""
+        """End the record before a vertex that is met edge-on: how it slides cannot be told in single precision."""
+        edge_on = active & scatter.si.is_valid() & (dr.abs(dr.dot(scatter.si.n, scatter.arrival)) < GRAZING)
+        dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on)
+
+    def cut(self) -> mi.Bool:
+        """Leave out what the walk has met edge-on; returns the lanes of which something was left out."""
+        short = self.whole < self.count
+        self.count = dr.minimum(self.count, self.whole)
+        return short
 
     def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
         """Store vertex `k` of the active lanes (the sink interface of `path_steps.walk`)."""

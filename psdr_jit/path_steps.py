@@ -62,6 +62,7 @@ class Scatter:
     """Emission and scattering at one vertex, while they are at hand. Detached."""
 
     si: mi.SurfaceInteraction3f
+    arrival: mi.Vector3f  # direction of travel in which the vertex was reached
     bsdf: mi.BSDFPtr
     β: mi.Spectrum  # throughput before the vertex
     emission: mi.Spectrum  # of the vertex itself, times its MIS weight
@@ -237,6 +238,7 @@ def walk(
             k,
             Scatter(
                 si=si,
+                arrival=ray.d,
                 bsdf=bsdf,
                 β=β,
                 emission=L_here,

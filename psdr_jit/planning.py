@@ -54,6 +54,7 @@ class Call:
     options: Options
     cache: dict
     rejected: Rejected
+    grazing: Rejected
     seed: int | mi.UInt32
     spp: int  # 0: left to the options and the sampler
     mode: str = "forward"  # or "backward"
@@ -91,7 +92,7 @@ def prepare(call: Call) -> Prepared:
     jobs = [
         (term, Job(
             call.integrator, call.scene, call.sensor, facts, call.options, plan, call.cache, shared, call.rejected,
-            call.seed, plan.term(term.name).spp,
+            call.grazing, call.seed, plan.term(term.name).spp,
         ))
         for term in TERMS if plan.term(term.name).runs
     ]  # fmt: skip
@@ -150,7 +151,7 @@ def _run_pilot(call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...]
     def job_of(form: str, seed: int, spp: int) -> Job:
         return Job(
             call.integrator, call.scene, call.sensor, facts, call.options, replace(plan, form=form), call.cache,
-            shared, Rejected(), seed, spp, trial,
+            shared, Rejected(), Rejected(), seed, spp, trial,
         )  # fmt: skip
 
     names = [term.name for term in plan.running]

@@ -15,11 +15,17 @@ class Rejected:
     def keep_finite(self, value: mi.Spectrum) -> mi.Spectrum:
         """`value` with 0 in lanes where any component is NaN or infinite; those are counted. Detached, evaluated."""
         sound = dr.all(dr.isfinite(value))
-        kept, dropped = dr.select(sound, value, 0), dr.select(sound, mi.UInt32(0), 1)
-        dr.eval(kept, dropped)  # at once: the sum alone would run whatever made `value`, and its use once more
-        self._count += dr.sum(dropped)
-        dr.schedule(self._count)
+        kept = dr.select(sound, value, 0)
+        dr.eval(kept, sound)  # at once: the sum alone would run whatever made `value`, and its use once more
+        self.count(~sound)
         return kept
+
+    def count(self, dropped: mi.Bool) -> None:
+        """Count the lanes set in `dropped`."""
+        number = dr.select(dropped, mi.UInt32(1), 0)
+        dr.eval(number)
+        self._count += dr.sum(number)
+        dr.schedule(self._count)
 
     def __int__(self) -> int:
         return int(self._count[0])

@@ -175,3 +175,19 @@ def test_fine_creases_are_sampled_by_what_they_show(llvm):
     balls = [stability.of_mesh(partial(meshes.round_ball, n)) for n in (1e4, 1e5)]
     coarse, fine = (stretched(ball, sppd=0).var(0, ddof=1).mean() for ball in balls)
     assert fine < 4 * coarse
+
+
+def test_the_outline_of_a_sphere_has_no_fireflies(llvm):
+    """Where a ray just touches a sphere, rounding makes the cosine 0 and the derivative anything at all."""
+    from psdr_jit import integrators, scene_io
+
+    scene = scene_io.load_scene(scene_io.shipped_scene("envmap_rotation.xml"), res=64)
+    motion = perturb(scene, "ball.to_world", X)
+    integrator = integrators.build({"type": "psdr_path", "max_depth": 2, "sppp": 0, "sppi": 0})
+    largest = []
+    for seed in range(64, 80):
+        motion.attach()
+        largest.append(np.abs(np.array(integrator.render_forward(scene, motion.params, seed=seed, spp=16))).max())
+    motion.restore()
+    assert max(largest) < 1e3  # 6e6 with such a ray
+    assert 0 < int(integrator.stats["grazing"]) < 1e-4 * 16 * 16 * 64 * 64

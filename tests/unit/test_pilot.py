@@ -127,7 +127,7 @@ FORMS = {  # (scene, parameter, depth): forms that come into question
     ("cbox", BOX, 4): ("spatial",),  # next to the large box
     ("baffled_light", "blocker.vertex_positions", 4): ("spatial", "material"),
     ("baffled_light", "blocker.vertex_positions", 2): ("spatial",),
-    ("baffled_light", "camera.to_world", 4): ("material",),
+    ("baffled_light", "camera.to_world", 4): ("spatial", "material"),
     ("cbox", "white.reflectance.value", 4): ("spatial",),
 }
 
