@@ -54,7 +54,9 @@ class PathRecords:
     def scattered(self, k: mi.UInt32, scatter, active: mi.Bool) -> None:
         """End the record before a vertex that is met edge-on: how it slides cannot be told in single precision."""
         edge_on = active & scatter.si.is_valid() & (dr.abs(dr.dot(scatter.si.n, scatter.arrival)) < GRAZING)
-        dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on)
+        # every lane has its own entry; any other mode would compile a kernel for every number of lanes
+        mode = dr.ReduceMode.NoConflicts
+        dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on, mode=mode)
 
     def cut(self) -> mi.Bool:
         """Leave out what the walk has met edge-on; returns the lanes of which something was left out."""

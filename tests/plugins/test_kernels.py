@@ -1,0 +1,40 @@
+"""Kernels are compiled once: neither a seed nor the number of paths that touch what moves makes new ones."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from psdr_jit import integrators, scene_io
+from psdr_jit.perturbation import perturb
+
+WARM_UP, CALLS = 4, 12
+
+
+@pytest.mark.parametrize("form", ["spatial", "material"])
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_later_calls_compile_nothing(llvm, mode, form):
+    scene = scene_io.load_scene(scene_io.shipped_scene("baffled_light.xml"), res=16)
+    motion = perturb(scene, "blocker.vertex_positions", (1, 0, 0))
+    integrator = integrators.build({"type": "psdr_path", "max_depth": 3, "form": form, "sppc": 4})
+    compiled = []
+    for seed in range(CALLS):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            if mode == "forward":
+                motion.attach()
+                dr.eval(integrator.render_forward(scene, motion.params, seed=seed, spp=4))
+            else:
+                θ = mi.Float(0)
+                dr.enable_grad(θ)
+                motion.params[motion.name] = motion.curve(θ)
+                motion.params.update()
+                integrator.render_backward(scene, motion.params, dr.ones(mi.TensorXf, (16, 16, 3)), seed=seed, spp=4)
+                assert np.isfinite(float(dr.grad(θ)[0]))
+            dr.sync_thread()
+            kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+            compiled.append(sum(not entry["cache_hit"] for entry in kernels))
+    motion.restore()
+    assert compiled[0] > 0 and not any(compiled[WARM_UP:]), compiled
