@@ -116,7 +116,7 @@ def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> Boun
         receiver=Hit.of(down, pd),
         r=r,
         ratio=dr.select(infinite, 0, r / (r + e.dist)),
-        value=-e.value * weight * (e.across / (pmf(dist, row) * count)),
+        value=-e.value * weight * (e.across / (pmf(dist, row) * dr.opaque(mi.Float, count))),
         wavelengths=it.wavelengths,
     )
     return compact(segment, active)

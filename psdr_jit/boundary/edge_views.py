@@ -150,7 +150,7 @@ def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges, wedges_of=
         side=side,
         receiver=Hit.of(down, pi),
         r=pi.t + line.lead,
-        weight=weight * (line.across / (pmf(dist, row) * pdf * count)),
+        weight=weight * (line.across / (pmf(dist, row) * pdf * dr.opaque(mi.Float, count))),
         wavelengths=wavelengths,
     )
     return compact(view, line.valid & pi.is_valid())

@@ -119,7 +119,7 @@ def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSam
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
     row, t = sample_edge(edges.distribution, stratified(count, rng.next_1d()))
     aperture = rng.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
-    sample = EdgeSample(row, t, aperture, dr.rcp(pmf(edges.distribution, row) * count), lane)
+    sample = EdgeSample(row, t, aperture, dr.rcp(pmf(edges.distribution, row) * dr.opaque(mi.Float, count)), lane)
 
     seen = _edge_point(edges, sample, frame)
     view, p = seen.point.view, seen.point.view.p
