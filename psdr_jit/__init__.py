@@ -10,7 +10,8 @@ Symbols of the papers, and what they are called in the code (`_d`: attached to t
     β, η           path throughput, accumulated relative IOR          β, η
     δL, λ          adjoint radiance, adjoint of a ray's origin        δL, λ_o
 
-Data flows one way: scene → scene_analysis → edge sets and distributions → interior | boundary terms → film → image.
+Data flows one way: scene → scene_analysis → plan → edge sets and distributions → interior | boundary terms → film →
+image. `planning` walks along it, `pilot` and `noise_log` tell it which form and how many samples.
 """
 
 from __future__ import annotations
