@@ -82,12 +82,19 @@ def _filter_mass(
     return (f * ((x > window[0]) & (x < window[1]))).sum(axis=1) / FILTER_NODES
 
 
+#: What `_pixel_mass` has returned, by everything that it depends on.
+_MASSES: dict[tuple, mi.TensorXf] = {}
+
+
 def _pixel_mass(film: mi.Film) -> mi.TensorXf:
     """∫ f over the sampled window around each pixel, (H, W, 1): the limit of Mitsuba's weight division."""
     lower, upper = sampled_window(film)
     offset, size = film.crop_offset(), film.crop_size()
-    x, y = (_filter_mass(film.rfilter(), offset[a], size[a], (lower[a], upper[a])) for a in (0, 1))
-    return mi.TensorXf((y[:, None] * x[None, :])[:, :, None].astype(np.float32))
+    key = (mi.variant(), str(film.rfilter()), *offset, *size, *lower, *upper)
+    if key not in _MASSES:
+        x, y = (_filter_mass(film.rfilter(), offset[a], size[a], (lower[a], upper[a])) for a in (0, 1))
+        _MASSES[key] = mi.TensorXf((y[:, None] * x[None, :])[:, :, None].astype(np.float32))
+    return _MASSES[key]
 
 
 def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> mi.TensorXf:

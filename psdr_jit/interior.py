@@ -30,7 +30,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .ad import tangents
-from .path_records import PathRecords
+from .path_records import GRAZING, PathRecords
 from .records import Arrival, Hit, Vertex
 from .trial import STILL, Shift, Trial
 
@@ -70,8 +70,11 @@ def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, shift: Shift, active
     ω = mi.Vector3f(hit.d)
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
     area = _area_element(si, on_surface)
-    measure = dr.abs_dot(si.n, ω) / dist2 * area
-    return si, ω, dr.select(on_surface & (measure > 0), dr.relative_grad(measure), 1)
+    cos = dr.abs_dot(si.n, ω)
+    # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
+    usable = on_surface & (cos > GRAZING) & (area > 0)
+    measure = dr.select(usable, cos / dist2 * area, 1)
+    return si, ω, dr.relative_grad(measure)
 
 
 def _emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, shift: Shift, active: mi.Bool):

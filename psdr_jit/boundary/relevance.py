@@ -152,13 +152,15 @@ def can_cast_shadow(job: Job, rows: EdgeRows) -> mi.Bool:
         if facts.infinite:
             axis = emitter.world_transform() @ mi.Vector3f(0, 0, -1)
             corners = [mi.Vector4f(dr.detach(axis.x), dr.detach(axis.y), dr.detach(axis.z), 0)]
+            extremes = corners
         else:
             box = job.scene.shapes()[job.facts.shapes[facts.shape].index].bbox() if facts.shape >= 0 else emitter.bbox()
             corners = [dr.opaque(mi.Vector4f, [*box.corner(i), 1.0]) for i in range(8)]
+            extremes = [corners[0], corners[7]]  # of all corners, the lowest and the highest in every coordinate
         possible = rows.border | rows.traced | _may_be_silhouette(rows, corners)
         if facts.shape >= 0 and job.facts.shapes[facts.shape].plugin in ("rectangle", "disk"):
             possible &= _in_front(rows, job.scene.shapes()[job.facts.shapes[facts.shape].index])
-        found |= possible & ~_leaves_scene(rows, corners, job.scene.bbox())
+        found |= possible & ~_leaves_scene(rows, extremes, job.scene.bbox())
     return found
 
 
