@@ -18,13 +18,13 @@ from .ad import accumulate, tangents
 from .interior import SceneTraits, backward_sweep, forward_sweep
 from .job import Job, passes
 from .low_discrepancy import pixel_sampler
-from .material_tangents import MaterialTangents
 from .path_records import PathRecords
 from .path_steps import PathLimits, first_hit, walk
 from .scattering import UNIFORM_SHARE
 from .streams import Stream, stream_seed
 from .touch import count_vertices, touches
 from .trial import registry_table
+from .walk_tangents import MaterialTangents, RadianceTangents
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
@@ -85,12 +85,10 @@ def touch_table(job: Job) -> mi.UInt32:
     return registry_table(job.scene, {s.index for s in shapes if s.geometry or s.shading or s.material})
 
 
-def only_materials(job: Job) -> bool:
-    """Do all enabled parameters belong to BSDFs? Then paths, emission and shading frames are constants."""
+def paths_rest(job: Job) -> bool:
+    """Do all enabled parameters belong to BSDFs and to the emission of lights? Then no path changes, nor its frames."""
     facts = job.facts
-    emission = any(e.pose or e.radiance for e in facts.emitters)
-    changes = facts.geometry_moves or emission or any(s.shading for s in facts.shapes)
-    return job.plan.prunes and not changes
+    return job.plan.prunes and not (facts.geometry_moves or any(s.shading for s in facts.shapes))
 
 
 def _limits(job: Job) -> PathLimits:
@@ -103,10 +101,11 @@ def _limits(job: Job) -> PathLimits:
 
 
 def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
-    """Derivative of every path's radiance by the materials it meets, without records."""
+    """Derivative of every path's radiance by the materials and lights it meets, without records."""
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
     sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
-    sink = MaterialTangents.zero()
+    lights = any(e.radiance for e in job.facts.emitters)
+    sink = (RadianceTangents if lights else MaterialTangents).zero()
     walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
     return job.rejected.keep_finite(sink.dL)
 
@@ -162,7 +161,7 @@ def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
 
 def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
     """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
-    if only_materials(job):
+    if paths_rest(job):
         return _along_the_walk(job, p)
     records, lane = _record(job, p)
     dL = dr.zeros(mi.Spectrum, dr.width(p.pos))

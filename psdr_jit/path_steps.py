@@ -65,10 +65,14 @@ class Scatter:
     arrival: mi.Vector3f  # direction of travel in which the vertex was reached
     bsdf: mi.BSDFPtr
     β: mi.Spectrum  # throughput before the vertex
-    emission: mi.Spectrum  # of the vertex itself, times its MIS weight
+    emission: mi.Spectrum  # of the vertex itself, times ...
+    weight_emission: mi.Float  # ... its MIS weight
+    emitter: mi.EmitterPtr  # that is met
     sees_emitter: mi.Bool
-    ω_em: mi.Vector3f  # emitter sample, local
-    from_emitter: mi.Spectrum  # what it sends, times MIS weight over density
+    ds: mi.DirectionSample3f  # emitter sample ...
+    ω_em: mi.Vector3f  # ... its direction, local ...
+    mis_em: mi.Float  # ... MIS weight ...
+    value_em: mi.Spectrum  # ... and radiance over density
     goes_on: mi.Bool
     wo: mi.Vector3f  # continuation, local
     delta: mi.Bool
@@ -196,7 +200,8 @@ def walk(
         ds = mi.DirectionSample3f(scene, si=si, ref=prev)
         pdf_em = scene.pdf_emitter_direction(prev, ds, ~prev_delta)
         weight_emission = dr.select(emission, mis_weight(prev_pdf, pdf_em), 0)
-        L_here = weight_emission * ds.emitter.eval(si, emission)
+        met = ds.emitter
+        L_here = weight_emission * met.eval(si, emission)
         L += β * L_here
 
         sink.radiance(k, L, active)
@@ -242,9 +247,13 @@ def walk(
                 bsdf=bsdf,
                 β=β,
                 emission=L_here,
+                weight_emission=weight_emission,
+                emitter=met,
                 sees_emitter=active_em,
+                ds=ds,
                 ω_em=ω_em,
-                from_emitter=mis_em * value_em,
+                mis_em=mis_em,
+                value_em=value_em,
                 goes_on=alive,
                 wo=bs.wo,
                 delta=bs.delta,
