@@ -77,6 +77,6 @@ def prb_table(rows: list[Row]) -> str:
         if {OURS, PRB} <= set(r):
             ours, prb = r[OURS], r[PRB]
             lines.append([case, f"{ours['seconds']['median'] * 1e3:.1f}", f"{prb['seconds']['median'] * 1e3:.1f}",
-                          f"{ours['variance']:.2e}", f"{prb['variance']:.2e}", f"{ours['cost'] / prb['cost']:.2f}"])
+                          f"{ours['variance']:.2e}", f"{prb['variance']:.2e}", f"{ours['cost'] / prb['cost']:.2g}"])
     head = ("parameter", "ms", "ms, prb", "variance", "variance, prb", "time at equal variance relative to prb")
     return markdown(head, lines)
