@@ -72,7 +72,9 @@ def _scenes() -> list[Comparison]:
     """One moving thing per shipped scene."""
     named = {case.scene: case for case in reversed(cases.CASES) if case.name not in ("material only", "cbox sunk")}
     others = {
-        "ball_shadow": ("blocker.to_world", X), "camera_crop": ("camera.to_world", X),
+        "furnace": ("walls.vertex_positions", X), "glowing_sphere": ("ball.to_world", X),
+        "camera_thinlens": ("camera.to_world", X), "ball_shadow": ("blocker.to_world", X),
+        "camera_crop": ("camera.to_world", X),
         "camera_orthographic_scaled": ("camera.to_world", X), "camera_perspective": ("camera.to_world", X),
         "coloured_emitter": ("card.vertex_positions", X), "concave_corner": ("camera.to_world", X),
         "constant_shadow": (BLOCKER, X), "cylinder_outline": ("tube.to_world", X),

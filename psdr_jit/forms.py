@@ -26,7 +26,7 @@ def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[
     touching = _touching(scene, facts)
     if touching:
         return ("spatial",), f"{touching} touch and move against each other"
-    return ("spatial", "material"), "no pilot yet"
+    return ("spatial", "material"), "there is no noise to compare the forms by"
 
 
 def _touching(scene: mi.Scene, facts: SceneFacts) -> str:

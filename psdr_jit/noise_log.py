@@ -39,6 +39,11 @@ class NoiseLog:
         return self.calls % REFRESH == 0
 
     @property
+    def epoch(self) -> int:
+        """Number of the pilot."""
+        return self.calls // REFRESH
+
+    @property
     def due(self) -> bool:
         """Is this a call at which budgets may change?"""
         return self.calls & (self.calls - 1) == 0
@@ -66,5 +71,7 @@ class NoiseLog:
         self.pairs += 1
         weight = max(FORGET, 1 / self.pairs)
         for form, name, n, variance in self.pending:
+            if name not in self.current.noise[form]:
+                continue
             self.current = self.current.observed(form, name, float(variance[0]), n, weight)
         self.pending.clear()

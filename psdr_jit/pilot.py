@@ -80,9 +80,9 @@ class Measurement:
         terms = {**self.noise[form], name: self.noise[form][name].observed(variance, n, weight)}
         return Measurement({**self.noise, form: terms})
 
-    def allocate(self, form: str, spp: Mapping[str, int]) -> dict[str, int]:
-        """Paths per pixel by term that cost as much as `spp` does, with the least variance."""
-        terms = self.noise[form]
+    def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
+        """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""
+        terms = {name: self.noise[form][name] for name in self.noise[form] if name in names}
         total = sum(t.cost * spp[name] for name, t in terms.items())
         if not any(t.at_more > 0 for t in terms.values()):
             return dict(spp)

@@ -124,58 +124,77 @@ def _plan(call: Call, facts: SceneFacts, budgets: Mapping[str, int], shared: dic
     if facts.geometry_moves and call.options.plan == "lean":
         geometry = Geometry(lone_convex(call.scene, call.sensor, facts, call.cache))
     forms, reason = forms_to_try(call.scene, facts, call.options)
-    plan = plans.make(facts, call.options, geometry, budgets, (forms[0], reason), "equal")
+
+    def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
+        return plans.make(facts, call.options, geometry, spp, form, why)
+
+    plan = made(budgets, (forms[0], reason), "equal")
     automatic = len(plan.running) > 1 and call.options.plan == "lean" and not call.options.budgets_set
-    if len(forms) == 1 and not automatic:
+    if not plan.running or (len(forms) == 1 and not automatic):
         return plan, None
-    log = _noise_log(call, facts, plan, forms, tuple(budgets.values()))
+    log = call.cache.setdefault(("noise", call.options, *_kind(call, facts, forms), *budgets.values()), NoiseLog())
     if log.needs_pilot and not dr.flag(dr.JitFlag.FreezingScope):  # which records, but must not read back
-        log.pilot(_run_pilot(call, facts, plan, forms, shared))
+        # Terms that are switched off here as well: integrators of one term each must agree on the form.
+        names = [term.name for term in made(dict.fromkeys(budgets, 1), (forms[0], ""), "").running]
+        log.pilot(_pilot(call, facts, plan, forms, names, log.epoch, shared))
     if log.current is not None and log.due:
         log.learn()
-        log.plan = _chosen(call, facts, geometry, budgets, log.current, automatic, (forms[0], reason))
+        form = _best_form(log.measured, max(budgets.values()), (forms[0], reason))
+        spp, why = budgets, "equal"
+        if automatic:
+            running = {term.name for term in plan.running}
+            spp, why = log.current.allocate(form[0], budgets, running), "by measured noise, as costly as equal ones"
+        log.plan = made(spp, form, why)
     log.calls += 1
     return log.plan or plan, log
 
 
-def _noise_log(call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], budgets: tuple[int, ...]) -> NoiseLog:
-    names = tuple(term.name for term in plan.running)
-    film = tuple(call.sensor.film().crop_size())
-    key = ("noise", facts.enabled, facts.sensor.name, film, call.options, forms, names, budgets)
-    return call.cache.setdefault(key, NoiseLog())
+def _kind(call: Call, facts: SceneFacts, forms: tuple[str, ...]) -> tuple:
+    """What calls of one kind have in common, whatever their budgets."""
+    o = call.options
+    options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction)
+    return (facts.enabled, facts.sensor.name, tuple(call.sensor.film().crop_size()), options, forms)
 
 
-def _run_pilot(call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], shared: dict) -> Measurement:
-    trial = trial_of(call.scene, facts)
+def _pilot(
+    call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int, shared: dict
+) -> Measurement:
+    """The pilot of this epoch; run unless an integrator with the same cache has done so."""
+    found = call.cache.setdefault(("pilot", *_kind(call, facts, forms)), {})
+    if epoch not in found:
+        trial = trial_of(call.scene, facts)
 
-    def job_of(form: str, seed: int, spp: int) -> Job:
-        return Job(
-            call.integrator, call.scene, call.sensor, facts, call.options, replace(plan, form=form), call.cache,
-            shared, Rejected(), Rejected(), seed, spp, trial,
-        )  # fmt: skip
+        def job_of(form: str, seed: int, spp: int) -> Job:
+            return Job(
+                call.integrator, call.scene, call.sensor, facts, call.options, replace(plan, form=form), call.cache,
+                shared, Rejected(), Rejected(), seed, spp, trial,
+            )  # fmt: skip
 
-    names = [term.name for term in plan.running]
-    return pilot.measure(job_of, forms, names, call.scene.environment() is not None)
+        found.clear()
+        found[epoch] = pilot.measure(job_of, forms, names, call.scene.environment() is not None)
+    return found[epoch]
 
 
-def _chosen(
-    call: Call, facts: SceneFacts, geometry: Geometry, budgets: Mapping[str, int], noise: Measurement, automatic: bool,
-    form: tuple[str, str],
-) -> Plan:  # fmt: skip
-    """The plan with the least variance × cost. `form`: if there is no choice."""
-    choices = {f: noise.allocate(f, budgets) if automatic else dict(budgets) for f in noise.noise}
-    work = {f: noise.efficiency(f, choices[f]) for f in choices}
+def _best_form(measured: Measurement, spp: int, single: tuple[str, str]) -> tuple[str, str]:
+    """The form with less variance × cost when all terms share the budget, and why; `single`: if there is one only.
+
+    By the pilot alone, so that integrators of single terms, whose images are added up, agree.
+    """
+    work = {}
+    for form, noise in measured.noise.items():
+        even = dict.fromkeys(noise, spp)
+        work[form] = measured.efficiency(form, measured.allocate(form, even, even))
     best, worst = min(work, key=work.get), max(work, key=work.get)
-    if len(work) > 1 and work[best] > 0:
-        form = (best, f"{work[worst] / work[best]:.2g} times less variance x cost than {worst}, by a pilot")
-    why = "by measured noise, as costly as equal ones" if automatic else "equal"
-    return plans.make(facts, call.options, geometry, choices[form[0]], form, why)
+    if len(work) < 2 or not work[best] > 0:
+        return single
+    return best, f"{work[worst] / work[best]:.2g} times less variance x cost than {worst}, by a pilot"
 
 
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
     """What differentiating `scene` by the parameters with gradients enabled would do, before a ray is traced.
 
-    `params`: names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing more).
+    `params`: name or names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing
+    more).
     `sensor`: its index, or the sensor. `integrator`: a `psdr_path`, a dict of its properties, or None. `spp`: as in
     `mi.render`, 0 for what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what
     rendering would raise: `OptionError`, `SceneError`, `UnsupportedError`.
@@ -185,7 +204,8 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
         integrator = build(integrator_spec(scene, integrator))
     if not hasattr(integrator, "call"):
         raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path")
-    names = [] if params is None or isinstance(params, mi.SceneParameters) else list(params)
+    names = [] if params is None or isinstance(params, mi.SceneParameters) else params
+    names = [names] if isinstance(names, str) else list(names)
     with also_enabled(scene, names):
         prepared = prepare(integrator.call(scene, view, 0, spp))
         counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.weights is not None}

@@ -27,6 +27,9 @@ class Rejected:
         self._count += dr.sum(number)
         dr.schedule(self._count)
 
+    def __repr__(self) -> str:
+        return str(int(self))
+
     def __int__(self) -> int:
         return int(self._count[0])
 

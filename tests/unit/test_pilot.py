@@ -40,7 +40,7 @@ def test_independent_samples_follow_the_square_root_rule():
     """n ∝ √(V/C) for p = 1, and the cost of equal budgets is kept."""
     measured = noise(interior=(1.0, 1.0, 1.0), primary=(4.0, 1.0, 1.0), direct=(1.0, 1.0, 4.0))
     spp = {"interior": 60, "primary": 60, "direct": 60}
-    n = measured.allocate("spatial", spp)
+    n = measured.allocate("spatial", spp, spp)
     assert n["primary"] == pytest.approx(2 * n["interior"], rel=0.05)
     assert n["direct"] == pytest.approx(n["interior"] / 2, rel=0.05)
     assert n["interior"] + n["primary"] + 4 * n["direct"] == pytest.approx(6 * 60, rel=0.03)
@@ -50,7 +50,7 @@ def test_independent_samples_follow_the_square_root_rule():
 def test_nothing_nearby_is_better(p):
     measured = noise(interior=(3.0, 1.0, 1.0), primary=(0.5, p, 1.2), direct=(9.0, 1.3, 2.5))
     spp = dict.fromkeys(("interior", "primary", "direct"), 400)
-    best = measured.allocate("spatial", spp)
+    best = measured.allocate("spatial", spp, spp)
     least = measured.efficiency("spatial", best)
     assert least < measured.efficiency("spatial", spp)
     rng = np.random.default_rng(1)
@@ -62,11 +62,16 @@ def test_nothing_nearby_is_better(p):
         assert measured.efficiency("spatial", {k: n * scale for k, n in other.items()}) >= 0.995 * least
 
 
+def both(n: int) -> tuple:
+    spp = {"interior": n, "primary": n}
+    return "spatial", spp, spp
+
+
 def test_a_term_that_the_pilot_missed_keeps_a_share():
-    n = noise(interior=(1.0, 1.0, 1.0), primary=(0.0, 1.0, 1.0)).allocate("spatial", {"interior": 64, "primary": 64})
+    n = noise(interior=(1.0, 1.0, 1.0), primary=(0.0, 1.0, 1.0)).allocate(*both(64))
     assert n["primary"] == pilot.LEAST * 64 and n["interior"] > 64
     nothing = noise(interior=(0.0, 1.0, 1.0), primary=(0.0, 1.0, 1.0))
-    assert nothing.allocate("spatial", {"interior": 5, "primary": 5}) == {"interior": 5, "primary": 5}
+    assert nothing.allocate(*both(5)) == {"interior": 5, "primary": 5}
 
 
 def test_the_exponent_is_that_of_two_sample_counts():
@@ -165,6 +170,17 @@ def test_forward_and_backward_mode_share_the_plan(variant):
     wJv, JTwv, w, Jv = adjoint_identity(scene, "blocker.vertex_positions", integrator, spp=8)
     assert len({t.spp for t in integrator.plan.running}) > 1
     assert abs(wJv - JTwv) <= 1e-5 * w * Jv
+
+
+def test_single_terms_agree_on_the_form(llvm):
+    """Their images are added up: a sum over different forms would be no derivative of anything."""
+    scene = scene_of("baffled_light", max_depth=3)
+    spec = {"type": "psdr_path", "max_depth": 3}
+    with also_enabled(scene, ["blocker.vertex_positions"]):
+        whole = prepare(integrators.build(spec).call(scene, scene.sensors()[0], 0, 16)).plan
+        for term in ("interior", "primary", "indirect"):
+            alone = prepare(integrators.build_term(spec, term).call(scene, scene.sensors()[0], 0, 16)).plan
+            assert alone.form == whole.form == "material" and [t.name for t in alone.running] == [term]
 
 
 def test_budgets_learn_from_images(llvm):
