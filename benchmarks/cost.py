@@ -62,7 +62,7 @@ SWEEPS = (
     Sweep("edges", "edges of the moving mesh", (1e2, 1e3, 1e4, 1e5, 1e6), of_ball),
     Sweep("parameters", "texture values that are differentiated", (12, 3e2, 3e4, 1e6), of_texture),
 )
-QUICK, QUICK_STRIDE = ("samples",), 2
+QUICK, QUICK_STRIDE = ("samples",), 3
 
 
 @dataclass

@@ -34,6 +34,16 @@ def positions_buffer(mesh: mi.Mesh) -> mi.Float:
     return _parameter(mesh, VERTEX_POSITIONS).array if INDEXED_MESHES else mesh.vertex_positions_buffer()
 
 
+def mesh_buffers(mesh: mi.Mesh) -> tuple:
+    """All arrays on which edges depend; each is replaced by another when it changes."""
+    if INDEXED_MESHES:
+        params = mi.traverse(mesh)
+        keys = (VERTEX_POSITIONS, VERTEX_NORMALS, VERTEX_TEXCOORDS, FACES)
+        return tuple(params[key].array for key in keys if key in params)
+    return (mesh.vertex_positions_buffer(), mesh.vertex_normals_buffer(), mesh.vertex_texcoords_buffer(),
+            mesh.faces_buffer())  # fmt: skip
+
+
 def mesh_faces(mesh: mi.Mesh) -> mi.Vector3u:
     """Corner indices (F) into `mesh_positions`."""
     if not INDEXED_MESHES:

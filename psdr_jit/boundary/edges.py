@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..analytic_edges import CurveSet, curve_set
+from ..compat import mesh_buffers
 from ..edge_distribution import EdgeDistribution, edge_distribution
 from ..edge_rows import EdgeRows
 from ..edge_set import EdgeSet, edge_set
@@ -79,13 +81,29 @@ def shared_frame(job: Job) -> SensorFrame:
     return job.shared["frame"]
 
 
+def _segments(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
+    """Straight edges of the scene; kept from call to call while every shape rests."""
+    shapes = [job.scene.shapes()[s.index] for s in meshes]
+    if job.facts.shapes_move or balls or not job.plan.prunes:
+        return edge_set(shapes, [s.moves for s in meshes], job.cache, balls)
+    buffers = [buffer for shape in shapes for buffer in mesh_buffers(shape)]
+    known = job.cache.get("resting edges")
+    # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
+    same = known is not None and [b.index for b in known[0]] == [b.index for b in buffers]
+    if not same:
+        known = (buffers, edge_set(shapes, [False] * len(shapes), job.cache))
+        job.cache["resting edges"] = known
+    rows = known[1].rows
+    return known[1] if rows is None else replace(known[1], meshes=tuple(shapes), rows=copy(rows))
+
+
 def _edge_table(job: Job) -> EdgeTable:
     shapes = job.scene.shapes()
     chosen = [s for s in job.facts.shapes if s.index >= 0]
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], job.cache)
-    segments = edge_set([shapes[s.index] for s in meshes], [s.moves for s in meshes], job.cache, balls)
+    segments = _segments(job, meshes, balls)
     if segments.rows is not None:
         outside = _seen_from_outside(job, meshes)
         rows = segments.rows  # not in place: the arrays may be those of the cached topology
