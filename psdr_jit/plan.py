@@ -1,8 +1,8 @@
 """The plan of a derivative render: which terms run, why, in which form and with how many samples. Pure data.
 
-It follows from the facts about the scene (`scene_analysis`) and from the options alone, before a ray is traced, and the
-integrator executes exactly it. A term is left out only where it is 0 for a reason that is stated; `plan="full"`
-leaves nothing out, which changes nothing but noise and time.
+Which terms run follows from the facts about the scene (`scene_analysis`) and from the options alone, before a ray is
+traced; form and budgets may take a pilot (`pilot`). The integrator executes exactly the plan. A term is left out only
+where it is 0 for a reason that is stated; `plan="full"` leaves nothing out, which changes nothing but noise and time.
 """
 
 from __future__ import annotations

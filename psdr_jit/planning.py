@@ -75,7 +75,7 @@ class Prepared:
 
 
 def prepare(call: Call) -> Prepared:
-    """Raises typed errors before any ray is traced."""
+    """The plan and its jobs. Raises typed errors before any ray is traced."""
     film = call.sensor.film()
     require_film(film)
     budgets = _budgets(call)
@@ -191,13 +191,13 @@ def _best_form(measured: Measurement, spp: int, single: tuple[str, str]) -> tupl
 
 
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
-    """What differentiating `scene` by the parameters with gradients enabled would do, before a ray is traced.
+    """What differentiating `scene` by the parameters with gradients enabled would do.
 
-    `params`: name or names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing
-    more).
-    `sensor`: its index, or the sensor. `integrator`: a `psdr_path`, a dict of its properties, or None. `spp`: as in
-    `mi.render`, 0 for what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what
-    rendering would raise: `OptionError`, `SceneError`, `UnsupportedError`.
+    Traces rays only where form or budgets depend on noise, for a pilot of a few samples per pixel. `params`: name or
+    names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing more). `sensor`: its
+    index, or the sensor. `integrator`: a `psdr_path`, a dict of its properties, or None. `spp`: as in `mi.render`, 0:
+    what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what rendering would raise:
+    `OptionError`, `SceneError`, `UnsupportedError`.
     """
     view = find_sensor(scene, sensor)
     if not hasattr(integrator, "call"):

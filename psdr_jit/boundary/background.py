@@ -25,7 +25,7 @@ from .edge_directions import background_wedges, wedge_measure
 from .edge_views import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
 from .edges import EdgeTable, background, compact, shared_frame
 from .relevance import SecondaryEdges, secondary_edges
-from .secondary import BoundarySamples
+from .secondary import BoundarySamples, motion_of
 from .sensor_subpath import SubpathRecords, subpaths
 
 #: Share of a resting edge's directions in which movers are behind it; otherwise they are in front.
@@ -77,10 +77,7 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
 
 def _source_motion(b: Background) -> mi.Float:
     """Attached −ρ s·v_S: of value 0."""
-    ray = mi.Ray3f(b.source.o, b.source.d)
-    flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    x = b.source.intersection().compute_surface_interaction(ray, flags, b.source.shape != 0).p
-    moved = -b.ratio * dr.dot(b.view.side, x)
+    moved = motion_of(b.source, -b.ratio * b.view.side)
     return moved - dr.detach(moved)
 
 

@@ -35,7 +35,7 @@ from .edge_directions import silhouette_wedges, wedge_measure
 from .edge_sources import source_from_curve, source_from_segment
 from .edges import compact, edge_samples, shared_frame
 from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
-from .secondary import BoundarySamples
+from .secondary import BoundarySamples, motion_of
 from .sensor_subpath import UNLIMITED_VERTICES, recorded_vertices, subpaths
 
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
@@ -130,11 +130,7 @@ def longest_subpath(job: Job) -> int:
 def source_motion(job: Job, segment: BoundarySegment) -> mi.Float:
     """Attached −(r_B/r_S) n_⊥·x_S, or −r_B n_⊥·ω for a directional light: what the emitter contributes."""
     emitter = dr.reinterpret_array(mi.EmitterPtr, segment.emitter)
-    ray = mi.Ray3f(segment.source.o, segment.source.d)
-    flags = mi.RayFlags.All | mi.RayFlags.FollowShape
-    si = segment.source.intersection().compute_surface_interaction(ray, flags, segment.source.shape != 0)
-    moved = -segment.ratio * dr.dot(segment.n, si.p)
-    moved = dr.select(segment.source.shape != 0, moved, 0)
+    moved = motion_of(segment.source, -segment.ratio * segment.n)
     if job.facts.has_delta_emitters:
         it = dr.zeros(mi.Interaction3f)
         it.p = segment.x

@@ -56,6 +56,13 @@ class _Motion:
     camera: mi.Float
 
 
+def motion_of(hit: Hit, covector: mi.Vector3f) -> mi.Float:
+    """`covector` applied to the material point `hit`, attached; 0 where there is no surface."""
+    there, flags = hit.shape != 0, mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+    x = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), flags, there).p
+    return dr.select(there, dr.dot(covector, x), 0)
+
+
 def _motion(job: Job, s: BoundarySamples) -> _Motion:
     at_edge = dr.dot(s.n, edge_motion(s.table, s.row, s.t, s.local)) + s.source_motion()
     c = s.records.data

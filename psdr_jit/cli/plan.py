@@ -1,6 +1,7 @@
 """Show what differentiating a scene would compute: terms, edges, samples and form, with the reasons.
 
-No ray is traced. Reads: 'psdr plan SCENE.xml --wrt box.vertex_positions --wrt lamp.position'.
+Renders nothing but, where form or budgets depend on noise, a pilot of a few samples per pixel.
+Example: 'psdr plan SCENE.xml --wrt box.vertex_positions --wrt lamp.position'.
 """
 
 from __future__ import annotations
