@@ -18,6 +18,7 @@ from benchmarks.suites import REFERENCE, Settings
 from psdr_jit.statistics import GroupedImages, gain
 
 NAME = "accuracy"
+BUDGET = 5.0  # [s]
 RES = 64
 LOAD = {"rfilter": "gaussian"}  # prb_reparam needs it, so everybody gets it
 REFERENCE_BUDGETS = 4.0  # seconds of the reference in budgets

@@ -25,6 +25,7 @@ from benchmarks.sweeps import Sweep
 from psdr_jit.perturbation import Perturbation
 
 NAME = "cost"
+BUDGET = 1.0  # [s]
 RES, SPP, DEPTH = 128, 16, 4
 WARM_UP, MIN_CALLS, MAX_CALLS = 3, 5, 25
 SLOW_CALL, MIN_SLOW_CALLS = 4.0, 1  # [s]; such a call is warm enough after the first

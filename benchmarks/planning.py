@@ -23,6 +23,7 @@ from psdr_jit.errors import PsdrError
 from psdr_jit.statistics import block_means
 
 NAME = "planning"
+BUDGET = 2.0  # [s]
 RES, SPP = 64, 16
 WARM_UP = 9  # calls: kernels are compiled, and budgets have learned from eight pairs of images
 MIN_ROUNDS, MAX_ROUNDS = 16, 64

@@ -24,7 +24,7 @@ from psdr_jit.cli import _common
 from psdr_jit.errors import PsdrError
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
-BUDGET, QUICK_BUDGET = 5.0, 2.0  # [s]
+QUICK_BUDGET = 2.0  # [s] at most
 QUICK_FOLDER = Path("out") / "bench-quick"
 PATIENCE = 240.0  # [s] without a word from a worker, beside what the budget explains
 BUDGETS_OF_PATIENCE = 8.0
@@ -38,13 +38,15 @@ class Task:
 
 
 def parser() -> argparse.ArgumentParser:
+    budgets = ", ".join(f"{name} {suite(name).BUDGET:g}" for name in SUITES)
     p = argparse.ArgumentParser(prog="psdr bench", description=__doc__,
                                 formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--suite", action="append", choices=SUITES, help="default: all; may be repeated")
     p.add_argument("--cases", metavar="A,B", help="only cases whose name contains one of these words")
     p.add_argument("--methods", metavar="A,B", help="only methods whose name contains one of these words")
     p.add_argument("--budget", type=float, metavar="S",
-                   help=f"seconds of rendering per case and method (default: {BUDGET:g}, --quick: {QUICK_BUDGET:g})")
+                   help=f"seconds of rendering per case and method (default: {budgets}; "
+                        f"--quick: {QUICK_BUDGET:g} at most)")
     p.add_argument("--quick", action="store_true",
                    help=f"a few cases, short: ten minutes on two cores; rows go to {QUICK_FOLDER}")
     p.add_argument("--out", type=Path, metavar="DIR",
@@ -72,6 +74,13 @@ def chosen(name: str, words: str | None) -> bool:
     return words is None or any(word.strip().lower() in name.lower() for word in words.split(",") if word.strip())
 
 
+def budget_of(name: str, args: argparse.Namespace) -> float:
+    """Seconds of rendering that a method gets per case of a suite."""
+    if args.budget is not None:
+        return args.budget
+    return min(QUICK_BUDGET, suite(name).BUDGET) if args.quick else suite(name).BUDGET
+
+
 def done(folder: Path, names: tuple[str, ...]) -> set[Task]:
     """Tasks that have a row."""
     paths = [path for name in names if (path := folder / f"{name}.jsonl").is_file()]
@@ -95,14 +104,15 @@ def measure(pending: list[Task], args: argparse.Namespace) -> int:
 
 def run_worker(name: str, case: str, methods: list[str], args: argparse.Namespace) -> tuple[list[str], str | None]:
     """Methods that are left, and what ended the worker if it did not end by itself. That method gets a row as well."""
-    request = {"suite": name, "case": case, "methods": methods, "folder": str(args.out), "budget": args.budget,
+    budget = budget_of(name, args)
+    request = {"suite": name, "case": case, "methods": methods, "folder": str(args.out), "budget": budget,
                "variant": args.variant}  # fmt: skip
     worker = subprocess.Popen([sys.executable, "-m", "benchmarks.worker"], cwd=rows.ROOT, stdin=subprocess.PIPE,
                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
     errors: list[str] = []
     reader = threading.Thread(target=lambda: errors.extend(worker.stderr), daemon=True)
     reader.start()
-    watchdog = Watchdog(worker, PATIENCE + BUDGETS_OF_PATIENCE * args.budget)
+    watchdog = Watchdog(worker, PATIENCE + BUDGETS_OF_PATIENCE * budget)
     current, left = methods[0], list(methods)
     try:
         worker.stdin.write(json.dumps(request))
@@ -125,7 +135,7 @@ def run_worker(name: str, case: str, methods: list[str], args: argparse.Namespac
     failure = "no answer within the time limit" if watchdog.bitten else why(status, errors)
     print(f"{name}: {case}: {current}: {failure}", flush=True)
     scene_io.use_variant(args.variant)
-    row = {"bench": name, "case": case, "method": current, "settings": {"budget": args.budget}, "status": "cannot",
+    row = {"bench": name, "case": case, "method": current, "settings": {"budget": budget}, "status": "cannot",
            "error": failure}  # fmt: skip
     rows.append(args.out / f"{name}.jsonl", {**row, **rows.circumstances()})
     left.remove(current)
@@ -164,10 +174,9 @@ class Watchdog:
 def main(argv: list[str] | None = None) -> int:
     args = parser().parse_args(argv)
     args.out = (args.out or (QUICK_FOLDER if args.quick else rows.RESULTS)).resolve()
-    if args.budget is None:
-        args.budget = QUICK_BUDGET if args.quick else BUDGET
     try:
-        _common.require_positive(budget=args.budget)
+        if args.budget is not None:
+            _common.require_positive(budget=args.budget)
         args.out.mkdir(parents=True, exist_ok=True)
     except (PsdrError, OSError) as error:
         print(f"psdr bench: error: {error}", file=sys.stderr)

@@ -24,6 +24,7 @@ from benchmarks.sweeps import Sweep
 from psdr_jit.finite_differences import CentralDifference
 
 NAME = "stability"
+BUDGET = 1.5  # [s]
 RES = 32
 REFERENCE_BUDGETS = 4.0
 SLOWEST_FIRST_RENDER = 45.0  # [s]

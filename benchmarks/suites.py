@@ -1,5 +1,6 @@
 """What a suite is: a module with `NAME` and the functions below. `run.py` knows no more about one.
 
+    BUDGET                                       seconds of rendering that a method gets per case, unless told
     case_names() -> list[str]                    quick_case_names() -> list[str]
     method_names(case) -> list[str]              in the order in which they run
     open_case(case, settings) -> opened          once per process
