@@ -1,4 +1,4 @@
-"""Is there only one body, and is it convex? Then nothing casts a shadow, and no surface sees another."""
+"""Which bodies are convex? If there is only one, and it is, nothing casts a shadow and no surface sees another."""
 
 from __future__ import annotations
 
@@ -30,11 +30,15 @@ def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, cache: di
         return ""
     box, (lower, upper) = scene.bbox(), origin_box(sensor_frame(sensor))
     outside = any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
-    return only.name if outside and _is_convex(scene.shapes()[0], only, cache) else ""
+    if not outside:
+        return ""
+    flat = only.plugin in ("disk", "rectangle")
+    return only.name if flat or is_convex_body(scene.shapes()[0], only, cache) else ""
 
 
-def _is_convex(shape: mi.Shape, facts: ShapeFacts, cache: dict) -> bool:
-    if facts.plugin in ("sphere", "disk", "rectangle"):
+def is_convex_body(shape: mi.Shape, facts: ShapeFacts, cache: dict) -> bool:
+    """Is it a sphere, or a closed convex mesh with its normals outward? False of meshes too large to look at."""
+    if facts.plugin == "sphere":
         return True
     if not facts.is_mesh or facts.faces * shape.vertex_count() > MAX_PAIRS:
         return False

@@ -30,7 +30,8 @@ class NoiseLog:
     measured: Measurement | None = None  # by the pilot
     current: Measurement | None = None  # with what was observed since
     plan: object = None  # made from `current` when it was last due
-    pairs: int = 0
+    pairs: int = 0  # of images that were compared since the last pilot
+    weighed: dict[tuple[str, str], int] = field(default_factory=dict)  # observations that count, by (form, term)
     last: dict[str, tuple[int, int, mi.TensorXf]] = field(default_factory=dict)  # term: (seed, paths, image)
     pending: list[tuple[str, str, int, mi.Float]] = field(default_factory=list)  # (form, term, paths, variance)
 
@@ -52,26 +53,29 @@ class NoiseLog:
         """Start again from a new pilot."""
         self.measured = self.current = measured
         self.pairs = 0
+        self.weighed.clear()
 
     def observe(self, form: str, seed: object, paths: Mapping[str, int], images: Mapping[str, mi.TensorXf]) -> None:
         """Compare the images of this call with those of the last one, if their seeds differ."""
         if not isinstance(seed, int) or not (self.pairs < EAGER or self.calls % SELDOM < 2):
             self.last.clear()
             return
+        compared = False
         for name, image in images.items():
             before = self.last.get(name)
             if before is not None and before[0] != seed and before[1] == paths[name]:
                 self.pending.append((form, name, paths[name], variance_of_pair(image, before[2])))
+                compared = True
             self.last[name] = (seed, paths[name], image)
+        self.pairs += compared
 
     def learn(self) -> None:
         """Let what was observed count."""
-        if not self.pending or self.current is None:
+        if self.current is None:
             return
-        self.pairs += 1
-        weight = max(FORGET, 1 / self.pairs)
         for form, name, n, variance in self.pending:
             if name not in self.current.noise[form]:
                 continue
-            self.current = self.current.observed(form, name, float(variance[0]), n, weight)
+            count = self.weighed[form, name] = self.weighed.get((form, name), 0) + 1
+            self.current = self.current.observed(form, name, float(variance[0]), n, max(FORGET, 1 / count))
         self.pending.clear()

@@ -26,8 +26,8 @@ IMAGES, FEW, MORE = 3, 1, 4
 #: Seeds of the pilot: far from those that a loop counts up from 0.
 FIRST_SEED = 0x5EED0000
 
-#: Derivative calls after which the pilot is run again: the scene has changed meanwhile.
-REFRESH = 200
+#: Derivative calls after which the pilot is run again, as the scene has changed: a power of two, see `noise_log`.
+REFRESH = 256
 
 #: Least and largest number of a term's paths relative to equal budgets: the pilot may have missed something rare.
 LEAST, MOST = 1 / 8, 8.0

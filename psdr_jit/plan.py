@@ -27,10 +27,12 @@ class EdgeCount:
     sampled: int
     total: int
     left_out: str
+    buried: int = 0  # of those left out: inside of other bodies
 
     def __str__(self) -> str:
         rest = f", {self.left_out}" if self.sampled < self.total else ""
-        return f"{self.sampled} of {self.total} edges{rest}"
+        inside = f"; {self.buried} lie inside of other bodies" if self.buried else ""
+        return f"{self.sampled} of {self.total} edges{rest}{inside}"
 
 
 @dataclass(frozen=True)

@@ -214,8 +214,8 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
 
 def _count(term: Term, job: Job) -> EdgeCount:
     table = scene_edges(job)
-    total = table.segment_count + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
+    total = table.segment_count + table.buried + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
     with dr.suspend_grad():
         weights = term.weights(job)
     sampled = 0 if weights is None else int(np.count_nonzero(np.array(weights)))
-    return EdgeCount(sampled, total, LEFT_OUT[term.name])
+    return EdgeCount(sampled, total, LEFT_OUT[term.name], table.buried)

@@ -19,6 +19,7 @@ from ..scene_analysis import ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box, sensor_frame
 from ..shape_pairs import warn_about_pairs
 from ..velocities import vertex_speeds
+from .buried import buried
 from .edge_points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
 
 
@@ -30,6 +31,7 @@ class EdgeTable:
     curves: CurveSet
     curve_moves: mi.UInt32  # by CurveRows.shape: 1 if the shape can move
     centre: mi.Point3f  # of the scene's bounding box
+    buried: int = 0  # straight edges that are left out because no path can reach them
 
     @property
     def segment_count(self) -> int:
@@ -103,7 +105,7 @@ def _edge_table(job: Job) -> EdgeTable:
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], job.cache)
-    segments = _segments(job, meshes, balls)
+    segments, buried_count = _without_buried(job, _segments(job, meshes, balls))
     if segments.rows is not None:
         outside = _seen_from_outside(job, meshes)
         rows = segments.rows  # not in place: the arrays may be those of the cached topology
@@ -115,7 +117,20 @@ def _edge_table(job: Job) -> EdgeTable:
             rows.moves = rows.moves & (moved | (rows.junction > 0))
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     centre = dr.opaque(mi.Point3f, list(job.scene.bbox().center()))
-    return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre)
+    return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre, buried_count)
+
+
+def _without_buried(job: Job, segments: EdgeSet) -> tuple[EdgeSet, int]:
+    """Straight edges that a path may reach, and how many others there are."""
+    # while a function is being frozen, values cannot be read: nothing is left out
+    if segments.rows is None or not job.plan.prunes or dr.flag(dr.JitFlag.FreezingScope):
+        return segments, 0
+    hidden = buried(job, segments.rows, shared_frame(job))
+    count = 0 if hidden is None else int(dr.count(hidden)[0])
+    if count == 0:
+        return segments, 0
+    total = dr.width(segments.rows.v0)
+    return replace(segments, rows=compact(segments.rows, ~hidden) if count < total else None), count
 
 
 def edge_samples(job: Job, frame: SensorFrame, paths: int) -> int:
