@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import rows
-from benchmarks.suites import REFERENCE, SUITES, suite
+from benchmarks.suites import ON_REQUEST, REFERENCE, SUITES, suite
 from benchmarks.worker import DONE, START
 from psdr_jit import scene_io
 from psdr_jit.cli import _common
@@ -38,10 +38,11 @@ class Task:
 
 
 def parser() -> argparse.ArgumentParser:
-    budgets = ", ".join(f"{name} {suite(name).BUDGET:g}" for name in SUITES)
+    budgets = ", ".join(f"{name} {suite(name).BUDGET:g}" for name in SUITES + ON_REQUEST)
     p = argparse.ArgumentParser(prog="psdr bench", description=__doc__,
                                 formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--suite", action="append", choices=SUITES, help="default: all; may be repeated")
+    p.add_argument("--suite", action="append", choices=SUITES + ON_REQUEST,
+                   help=f"default: all but {', '.join(ON_REQUEST)}; may be repeated")
     p.add_argument("--cases", metavar="A,B", help="only cases whose name contains one of these words")
     p.add_argument("--methods", metavar="A,B", help="only methods whose name contains one of these words")
     p.add_argument("--budget", type=float, metavar="S",

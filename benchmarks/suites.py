@@ -16,6 +16,7 @@ from typing import Any
 
 REFERENCE = "reference"  # the method that others are compared with: it runs first, and always
 SUITES = ("accuracy", "stability", "cost", "planning")
+ON_REQUEST = ("inverse",)  # not part of a full run
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,9 @@ def summary(row: dict) -> str:
     if row.get("status") == "cannot":
         return f"cannot ({row['error']})"
     shown = {"gain": ".3f", "error_10s": ".2e", "cost": ".2e", "rms_stderr": ".1e", "relative_rmse": ".3f"}
+    if "solved" in row:
+        figures = "  ".join(f"{name} {row['before'][name]:.3g} -> {value:.3g}" for name, value in row["after"].items())
+        return f"{'solved' if row['solved'] else 'not solved'} in {row['seconds']:.0f} s  {figures}"
     figures = [f"{name} {row[name]:{form}}" for name, form in shown.items() if name in row]
     return "  ".join(figures) or "measured"
 

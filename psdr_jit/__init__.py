@@ -27,6 +27,9 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from . import plugins as plugins  # registers the integrators, now and after every variant switch
     from .check import CheckResult, check_gradient
     from .gradient import GradientResult, gradient
+    from .inverse.optimize import optimize
+    from .inverse.shapes import Profile, Vertices
+    from .inverse.variables import Parameter, Pose
     from .params import ParamInfo, differentiable_params
     from .plan import Plan
     from .planning import make_plan
@@ -35,9 +38,14 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "CheckResult",
         "GradientResult",
         "ParamInfo",
+        "Parameter",
         "Plan",
+        "Pose",
+        "Profile",
+        "Vertices",
         "check_gradient",
         "differentiable_params",
         "gradient",
         "make_plan",
+        "optimize",
     ]

@@ -51,6 +51,11 @@ def mesh_faces(mesh: mi.Mesh) -> mi.Vector3u:
     return mi.Vector3u(_parameter(mesh, FACES), flip_axes=True)
 
 
+def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
+    """The array that holds the corner indices, replaced whenever they change."""
+    return _parameter(mesh, FACES).array if INDEXED_MESHES else mesh.faces_buffer()
+
+
 def pack_positions(points: mi.Point3f) -> mi.Float | mi.TensorXf:
     """`points` in the form in which the parameter `VERTEX_POSITIONS` is assigned."""
     return mi.TensorXf(points, flip_axes=True) if INDEXED_MESHES else dr.ravel(points)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .compat import mesh_faces, mesh_positions
+from .compat import faces_buffer, mesh_faces, mesh_positions
 from .mesh_edges import build_edge_topology
 from .mesh_shells import edge_shells
 from .scene_analysis import SceneFacts, ShapeFacts
@@ -47,14 +47,18 @@ def is_convex_body(shape: mi.Shape, facts: ShapeFacts, cache: dict) -> bool:
 
 def _is_closed(mesh: mi.Mesh, cache: dict) -> bool:
     """One closed surface with its normals outward. Remembered while the faces are the same."""
-    faces = dr.ravel(mesh_faces(mesh))
+    faces = faces_buffer(mesh)
     key = ("closed", mesh.id())
     known = cache.get(key)
-    if known is None or dr.width(known[0]) != dr.width(faces) or not dr.all(known[0] == faces):
+    if known is None or not _same(known[0], faces):
         p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
         topology = build_edge_topology(p, f)
         cache[key] = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
     return cache[key][1]
+
+
+def _same(a: mi.UInt32, b: mi.UInt32) -> bool:
+    return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
 
 
 def _is_behind_its_faces(mesh: mi.Mesh) -> bool:
@@ -66,5 +70,5 @@ def _is_behind_its_faces(mesh: mi.Mesh) -> bool:
     a, b, c = (dr.gather(mi.Point3f, positions, corners[k]) for k in range(3))
     normal = dr.normalize(dr.cross(b - a, c - a))
     height = dr.dot(normal, dr.gather(mi.Point3f, positions, pair % n) - a)
-    extent = dr.norm(mesh.bbox().extents())
+    extent = dr.opaque(mi.Float, float(dr.norm(mesh.bbox().extents())))
     return not dr.any(height > FLATNESS * extent)[0]

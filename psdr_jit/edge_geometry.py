@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .mesh_edges import EdgeTopology
+from .upload import uploaded
 
 UNIT_ROUNDOFF = 2.0**-24  # of float32, in which rays are traced
 MAX_BLUR = 1e-2  # of the longest side: a collapsed face is met nowhere
@@ -57,17 +58,17 @@ def upload_topology(topology: EdgeTopology) -> EdgeTopologyDevice:
     corner1 = np.where(border[:, None], topology.corner0, topology.corner1).astype(np.uint32)
     f1 = np.where(border, topology.f0, topology.f1)
     return EdgeTopologyDevice(
-        v0=mi.UInt32(topology.v0),
-        v1=mi.UInt32(topology.v1),
-        f0=mi.UInt32(topology.f0),
-        f1=mi.UInt32(f1),
-        apex0=mi.UInt32(3 - corner0.sum(axis=1, dtype=np.uint32)),
-        apex1=mi.UInt32(3 - corner1.sum(axis=1, dtype=np.uint32)),
-        corner0=mi.Vector2u(*(mi.UInt32(np.ascontiguousarray(column)) for column in corner0.T)),
-        corner1=mi.Vector2u(*(mi.UInt32(np.ascontiguousarray(column)) for column in corner1.T)),
-        opposed=mi.Bool((corner1[:, 1] + 1) % 3 == corner1[:, 0]),
-        border=mi.Bool(border),
-        split=mi.Bool(topology.split),
+        v0=uploaded(mi.UInt32, topology.v0),
+        v1=uploaded(mi.UInt32, topology.v1),
+        f0=uploaded(mi.UInt32, topology.f0),
+        f1=uploaded(mi.UInt32, f1),
+        apex0=uploaded(mi.UInt32, 3 - corner0.sum(axis=1, dtype=np.uint32)),
+        apex1=uploaded(mi.UInt32, 3 - corner1.sum(axis=1, dtype=np.uint32)),
+        corner0=mi.Vector2u(*(uploaded(mi.UInt32, column) for column in corner0.T)),
+        corner1=mi.Vector2u(*(uploaded(mi.UInt32, column) for column in corner1.T)),
+        opposed=uploaded(mi.Bool, (corner1[:, 1] + 1) % 3 == corner1[:, 0]),
+        border=uploaded(mi.Bool, border),
+        split=uploaded(mi.Bool, topology.split),
     )
 
 

@@ -41,6 +41,8 @@ class EdgeRows:
 
 def concatenate(parts: list[EdgeRows]) -> EdgeRows:
     """All rows of several tables, in order."""
+    dr.eval(parts)  # at once: concatenation would evaluate column by column
+
     def join(values):
         first = values[0]
         if dr.depth_v(first) == 1:

@@ -13,12 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .compat import mesh_faces, mesh_positions
+from .compat import faces_buffer, mesh_faces, mesh_positions
 from .edge_geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .edge_rows import EdgeRows, concatenate
 from .junctions import Ball, JunctionRows, Solid, find_junctions
 from .mesh_edges import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
 from .mesh_shells import edge_shells
+from .upload import uploaded
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
@@ -65,6 +66,7 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict, balls: tupl
     for i, mesh in enumerate(meshes):
         positions = dr.detach(mesh_positions(mesh))
         faces = mesh_faces(mesh)
+        dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
         topology = _cached_topology(mesh, positions, faces, cache)
         parts.append(_rows(mesh, positions, faces, topology, i, first_vertex, moving[i]))
         solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
@@ -99,20 +101,25 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
 
 
 def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dict) -> _MeshTopology:
-    buffer = dr.ravel(faces)
-    dr.eval(buffer)
+    buffer = faces_buffer(mesh)
     key = ("edges", mesh.id(), dr.width(positions), dr.width(faces))
     known = cache.get(key)
-    if known is not None and dr.all(known.faces == buffer) and _welds_hold(known.device, positions, faces):
+    if known is not None and _still_holds(known, buffer, positions, faces):
         return known
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
     from .scene_checks import warn_about_mesh  # not at the top: the checks stand above the edge sets
 
     warn_about_mesh(mesh.id(), topology)
-    shell = mi.Float(edge_shells(topology, p, f))
+    shell = uploaded(mi.Float, edge_shells(topology, p, f))
     cache[key] = _MeshTopology(buffer, topology, upload_topology(topology), shell)
+    _still_holds(cache[key], buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
     return cache[key]
+
+
+def _still_holds(known: _MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+    same = known.faces.index == buffer.index or bool(dr.all(known.faces == buffer)[0])
+    return same and _welds_hold(known.device, positions, faces)
 
 
 def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:
@@ -196,6 +203,7 @@ def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
     sides are found by tracing rays, because topology no longer says which face is on top. Rows of a moving and of a
     static shape are left apart: their motion relative to each other is what counts.
     """
+    dr.eval(rows)
     border = np.array(rows.border)
     few = len(border) <= MAX_COMPARED_EDGES
     candidate = np.arange(len(border)) if few else np.flatnonzero(border)
@@ -209,16 +217,17 @@ def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
     if pairs:
         _join_borders(rows, np.array(pairs))
     for g in others:
-        dr.scatter(rows.traced, mi.Bool(True), mi.UInt32(g[:1]))
+        dr.scatter(rows.traced, mi.Bool(True), uploaded(mi.UInt32, g[:1]))
     keep = np.ones(len(border), bool)
     for g in group:
         keep[g[1:]] = False
-    return dr.gather(EdgeRows, rows, mi.UInt32(np.flatnonzero(keep)))
+    return dr.gather(EdgeRows, rows, uploaded(mi.UInt32, np.flatnonzero(keep)))
 
 
 def _coinciding(rows: EdgeRows, candidate: np.ndarray, motion: np.ndarray) -> list[np.ndarray]:
     """Groups of two or more rows with the same end points and the same entry in `motion`."""
-    ends = [np.array(dr.gather(mi.Point3f, p, mi.UInt32(candidate))).T for p in (rows.p0, rows.p1)]
+    index = uploaded(mi.UInt32, candidate)
+    ends = [np.array(dr.gather(mi.Point3f, p, index)).T for p in (rows.p0, rows.p1)]
     start, end = weld_vertices(np.concatenate(ends)).reshape(2, -1)
     count = max(start.max(), end.max()) + 1
     key = (np.minimum(start, end) * count + np.maximum(start, end)) * 2 + motion
@@ -229,7 +238,7 @@ def _coinciding(rows: EdgeRows, candidate: np.ndarray, motion: np.ndarray) -> li
 
 def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
     """Give the first border of every pair the second one's face, in place."""
-    a, b = mi.UInt32(pairs[:, 0]), mi.UInt32(pairs[:, 1])
+    a, b = uploaded(mi.UInt32, pairs[:, 0]), uploaded(mi.UInt32, pairs[:, 1])
 
     def of(values, index):
         return dr.gather(type(values), values, index)

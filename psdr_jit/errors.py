@@ -37,3 +37,11 @@ class ZeroDerivativeWarning(UserWarning):
 
 class UnsupportedWarning(UserWarning):
     """A part of the derivative is not modelled; the message names it."""
+
+
+class CheckpointError(PsdrError, RuntimeError):
+    """The state of an optimisation cannot be written or read."""
+
+
+class StalledWarning(UserWarning):
+    """A variable has had no gradient for several iterations; the message says why."""

@@ -95,14 +95,12 @@ def write_panels(path: str | os.PathLike, panels: Sequence[tuple[str, str, np.nd
     Derivatives show the mean of their channels; all of them share one symmetric scale, set by a percentile
     so that a few noisy pixels do not wash out the rest.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    derivatives = [_grey(image) for kind, _, image in panels if kind == "derivative"]
+    derivatives = [grey(image) for kind, _, image in panels if kind == "derivative"]
     limit = robust_limit(derivatives) if derivatives else 1.0
     # Figure instead of pyplot: no global state, no display
     figure = Figure(figsize=(3.6 * len(panels) + 0.9, 3.9), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     shown = None
     for axis, (kind, title, image) in zip(axes, panels, strict=True):
@@ -111,11 +109,19 @@ def write_panels(path: str | os.PathLike, panels: Sequence[tuple[str, str, np.nd
         if kind == "primal":
             axis.imshow(srgb(image), interpolation="nearest")
         else:
-            shown = axis.imshow(_grey(image), cmap=COLOUR_MAP, vmin=-limit, vmax=limit,
+            shown = axis.imshow(grey(image), cmap=COLOUR_MAP, vmin=-limit, vmax=limit,
                                 interpolation="nearest")
     if shown is not None:
         derivative_axes = [a for a, p in zip(axes, panels, strict=True) if p[0] == "derivative"]
         figure.colorbar(shown, ax=derivative_axes, label=unit, shrink=0.85)
+    return save_figure(path, figure)
+
+
+def save_figure(path: str | os.PathLike, figure: Any) -> Path:
+    """Write a Matplotlib figure as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
     return _atomically(path, lambda temporary: figure.savefig(temporary, format="png"))
 
 
@@ -134,7 +140,8 @@ def srgb(image: np.ndarray) -> np.ndarray:
     return np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
+def grey(image: np.ndarray) -> np.ndarray:
+    """Mean of the colour channels (H, W)."""
     image = np.asarray(image, dtype=np.float64)
     return image if image.ndim == 2 else image[..., : min(3, image.shape[-1])].mean(-1)
 

@@ -23,6 +23,7 @@ from .edge_rows import EdgeRows
 from .errors import UnsupportedWarning
 from .mesh_edges import EdgeTopology
 from .shape_pairs import box_of, crossing
+from .upload import uploaded
 
 #: Pieces into which the full circle of a ball in a plane is cut.
 ARC_PIECES = 64
@@ -221,20 +222,21 @@ def _upload(found: list[tuple]) -> JunctionTable:
     count = len(start)
     arc = radius > 0
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", a["n"], b["n"]), -1, 1))
-    zeros = mi.UInt32(np.zeros(count, np.uint32))
+    zeros = uploaded(mi.UInt32, np.zeros(count, np.uint32))
     none = mi.Vector2u(zeros, zeros)
     edges = EdgeRows(
         v0=zeros, v1=zeros, apex0=zeros, apex1=zeros, p0=_point(start), p1=_point(end),
         n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
-        angle=mi.Float(angle), blur=mi.Float(np.zeros(count, np.float32)), border=mi.Bool(np.zeros(count, bool)),
-        seam=mi.Bool(np.ones(count, bool)), smooth=mi.Bool(np.zeros(count, bool)),
-        pattern=mi.Bool(np.ones(count, bool)), traced=mi.Bool(np.ones(count, bool)), moves=mi.Bool(moves),
-        junction=mi.UInt32(np.arange(1, count + 1, dtype=np.uint32)),
-        shell0=mi.Float(np.where(arc, 0, a["shell"])), shell1=mi.Float(np.where(arc, 0, b["shell"])),
+        angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
+        border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),
+        traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
+        junction=_index(np.arange(1, count + 1)),
+        shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),
+        shell1=uploaded(mi.Float, np.where(arc, 0, b["shell"])),
         shape0=_index(a["index"]), shape1=_index(np.where(b["is_ball"], a["index"], b["index"])),
         prim0=_index(a["prim"]), prim1=_index(b["prim"]), corner0=none, corner1=mi.Vector2u(none),
     )  # fmt: skip
-    rows = JunctionRows(_device_sheet(a), _device_sheet(b), _point(centre), mi.Float(radius))
+    rows = JunctionRows(_device_sheet(a), _device_sheet(b), _point(centre), uploaded(mi.Float, radius))
     dr.eval(edges, rows)
     return JunctionTable(edges, rows)
 
@@ -242,17 +244,21 @@ def _upload(found: list[tuple]) -> JunctionTable:
 def _device_sheet(s: dict) -> Sheet:
     return Sheet(
         _index(s["shape"]), _index(s["prim"]), _point2(s["uv_start"]), _point2(s["uv_end"]),
-        mi.Normal3f(_point(s["n"])), _point(s["centre"]), mi.Bool(s["is_ball"]),
+        mi.Normal3f(_point(s["n"])), _point(s["centre"]), uploaded(mi.Bool, s["is_ball"]),
     )  # fmt: skip
 
 
+def _flags(count: int, value: bool) -> mi.Bool:
+    return uploaded(mi.Bool, np.full(count, value))
+
+
 def _index(values: np.ndarray) -> mi.UInt32:
-    return mi.UInt32(np.ascontiguousarray(values, dtype=np.uint32))
+    return uploaded(mi.UInt32, np.asarray(values, np.uint32))
 
 
 def _point(values: np.ndarray) -> mi.Point3f:
-    return mi.Point3f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Point3f(*(uploaded(mi.Float, column) for column in np.asarray(values, np.float32).T))
 
 
 def _point2(values: np.ndarray) -> mi.Point2f:
-    return mi.Point2f(np.ascontiguousarray(values.T, dtype=np.float32))
+    return mi.Point2f(*(uploaded(mi.Float, column) for column in np.asarray(values, np.float32).T))

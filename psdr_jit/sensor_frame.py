@@ -24,20 +24,23 @@ KINDS = {
 
 @dataclass(frozen=True)
 class SensorFrame:
-    """Detached geometry of one sensor. Local space: the camera looks along +z from the origin."""
+    """Detached geometry of one sensor. Local space: the camera looks along +z from the origin.
+
+    Numbers that change with the pose, if only by rounding, are opaque: a camera that moves compiles no new kernels.
+    """
 
     kind: str
     to_world: mi.Transform4f
     to_local: mi.Transform4f
     corner: mi.Point2f  # film (0, 0) on the plane z = 1 (orthographic: any z)
     extent: mi.Point2f  # film width and height there, signed
-    near: float
-    far: float
-    focus: float  # distance of the plane in focus (thin lens)
-    aperture: float  # lens radius, 0 for a pinhole
+    near: mi.Float
+    far: mi.Float
+    focus: mi.Float  # distance of the plane in focus (thin lens)
+    aperture: mi.Float  # lens radius, 0 for a pinhole
     crop_offset: tuple[int, int]
     crop_size: tuple[int, int]
-    stretch: tuple[float, float]  # of the pose, across and along the view (a perspective pose has none)
+    stretch: tuple[mi.Float, mi.Float]  # of the pose, across and along the view (a perspective pose has none)
     window: tuple[tuple[float, float], tuple[float, float]]  # film region with camera samples [px]
 
     @property
@@ -92,13 +95,12 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         kind=kind,
         to_world=to_world,
         to_local=to_local,
-        # opaque: a field of view that changes must not compile new kernels
         corner=dr.opaque(mi.Point2f, (x[0], y[0])),
         extent=dr.opaque(mi.Point2f, (x[1] - x[0], y[2] - y[0])),
-        near=near[0],
-        far=far,
-        focus=focus,
-        aperture=aperture,
+        near=dr.opaque(mi.Float, near[0]),
+        far=dr.opaque(mi.Float, far),
+        focus=dr.opaque(mi.Float, focus),
+        aperture=dr.opaque(mi.Float, aperture),
         crop_offset=tuple(film.crop_offset()),
         crop_size=tuple(film.crop_size()),
         stretch=_stretch(to_world),
@@ -106,11 +108,13 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
     )
 
 
-def _stretch(to_world: mi.Transform4f) -> tuple[float, float]:
+def _stretch(to_world: mi.Transform4f) -> tuple[mi.Float, mi.Float]:
     """Area factor across and length factor along the view: an orthographic pose carries the sensor's width."""
     x, y, z = (to_world @ axis for axis in (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)))
-    length = float(dr.norm(z)[0])
-    return float(dr.abs(dr.dot(dr.cross(x, y), z))[0]) / length, length
+    length = dr.norm(z)
+    across = dr.abs(dr.dot(dr.cross(x, y), z)) / length
+    dr.make_opaque(across, length)
+    return across, length
 
 
 def lens_point(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Point3f:
@@ -126,9 +130,10 @@ def origin_box(frame: SensorFrame) -> tuple[list[float], list[float]]:
     if frame.kind == "orthographic":
         x0, y0 = float(frame.corner.x[0]), float(frame.corner.y[0])
         x1, y1 = x0 + float(frame.extent.x[0]), y0 + float(frame.extent.y[0])
-        local = [(x, y, frame.near) for x in (x0, x1) for y in (y0, y1)]
+        near = float(frame.near[0])
+        local = [(x, y, near) for x in (x0, x1) for y in (y0, y1)]
     else:
-        r = frame.aperture
+        r = float(frame.aperture[0])
         local = [(x, y, 0.0) for x in (-r, r) for y in (-r, r)]
     points = frame.to_world @ mi.Point3f(*(mi.Float(column) for column in zip(*local, strict=True)))
     return [float(dr.min(c)[0]) for c in points], [float(dr.max(c)[0]) for c in points]

@@ -68,6 +68,14 @@ BOX_FACES = np.array([
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 ])  # fmt: skip
 
+PROFILE_POINTS, PROFILE_RADIUS, PROFILE_HEIGHT = 100, 0.8, 0.6
+PROFILE_WAVES = ((2, 0.08, 0.4), (3, 0.10, 1.0), (5, 0.12, 0.0), (8, 0.03, 2.0))  # around: count, amplitude, phase
+BALL_ROUNDS, BALL_RADIUS = 3, 0.75
+KNOB_ROUNDS, KNOB_RADIUS, WAIST = 4, 0.75, 0.06
+BULGES = (  # direction, height, width
+    ((1, 0.6, 0.3), 0.35, 0.2), ((-0.7, 0.8, -0.4), 0.25, 0.15), ((0, -0.9, 0.6), 0.3, 0.25),
+)  # fmt: skip
+
 
 class Space:
     """The parts accepted so far; tells whether another one has room."""
@@ -274,6 +282,65 @@ def occluders() -> tuple[np.ndarray, np.ndarray]:
     return joined(parts)
 
 
+def extruded() -> tuple[np.ndarray, np.ndarray]:
+    """A prism over a rounded star of `PROFILE_POINTS` corners, closed by fans around the middle."""
+    n = PROFILE_POINTS
+    k, after = np.arange(n), (np.arange(n) + 1) % n
+    angle = 2 * np.pi * k / n
+    radius = PROFILE_RADIUS * (1 + sum(a * np.cos(w * angle + p) for w, a, p in PROFILE_WAVES))
+    rim = np.stack([radius * np.cos(angle), np.zeros(n), -radius * np.sin(angle)], 1)
+    low, high = rim - [0, PROFILE_HEIGHT / 2, 0], rim + [0, PROFILE_HEIGHT / 2, 0]
+    middle = np.array([[0, -PROFILE_HEIGHT / 2, 0], [0, PROFILE_HEIGHT / 2, 0]])
+    faces = [
+        np.stack([k, after, after + n], 1), np.stack([k, after + n, k + n], 1),
+        np.stack([after, k, np.full(n, 2 * n)], 1), np.stack([k + n, after + n, np.full(n, 2 * n + 1)], 1),
+    ]  # fmt: skip
+    return np.concatenate([low, high, middle]), np.concatenate(faces)
+
+
+def icosphere(rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    """The unit icosahedron with every face cut into four, so many times."""
+    g = (1 + np.sqrt(5)) / 2
+    p = [unit(np.array(v, float)) for v in (
+        (-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
+        (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1))]  # fmt: skip
+    faces = [
+        (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+        (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7),
+        (9, 8, 1),
+    ]  # fmt: skip
+    for _ in range(rounds):
+        middles: dict[tuple[int, int], int] = {}
+
+        def middle(a: int, b: int, middles: dict[tuple[int, int], int] = middles) -> int:
+            key = (min(a, b), max(a, b))
+            if key not in middles:
+                p.append(unit(p[a] + p[b]))
+                middles[key] = len(p) - 1
+            return middles[key]
+
+        cut = []
+        for a, b, c in faces:
+            ab, bc, ca = middle(a, b), middle(b, c), middle(c, a)
+            cut += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+        faces = cut
+    return np.array(p), np.array(faces)
+
+
+def ball() -> tuple[np.ndarray, np.ndarray]:
+    """What a reconstruction starts from."""
+    positions, faces = icosphere(BALL_ROUNDS)
+    return BALL_RADIUS * positions, faces
+
+
+def knob() -> tuple[np.ndarray, np.ndarray]:
+    """A round body with three bulges and a waist, of another triangulation than `ball`."""
+    d, faces = icosphere(KNOB_ROUNDS)
+    d = d @ random_rotation(np.random.default_rng(SEED)).T
+    bulges = sum(h * np.exp(-(1 - d @ unit(np.array(c))) / w) for c, h, w in BULGES)
+    return (KNOB_RADIUS * (1 - WAIST * np.exp(-((d[:, 1] / 0.3) ** 2)) + bulges))[:, None] * d, faces
+
+
 def write_ply(path: Path, positions: np.ndarray, faces: np.ndarray) -> None:
     """Binary PLY: float32 positions, and triangles of int32 indices."""
     header = (
@@ -287,7 +354,8 @@ def write_ply(path: Path, positions: np.ndarray, faces: np.ndarray) -> None:
 
 
 def main() -> None:
-    for name, make in {"branching": branching, "occluders": occluders}.items():
+    makers = {"branching": branching, "occluders": occluders, "extruded": extruded, "ball": ball, "knob": knob}
+    for name, make in makers.items():
         write_ply(MESHES / f"{name}.ply", *make())
 
 

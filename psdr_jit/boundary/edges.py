@@ -115,6 +115,7 @@ def _edge_table(job: Job) -> EdgeTable:
             speed = vertex_speeds(segments.meshes)
             moved = sum(dr.gather(mi.Float, speed, v) for v in (rows.v0, rows.v1)) > 0
             rows.moves = rows.moves & (moved | (rows.junction > 0))
+        dr.eval(rows)  # now, and not with whichever term needs them first: that one's kernels would differ
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     centre = dr.opaque(mi.Point3f, list(job.scene.bbox().center()))
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre, buried_count)

@@ -178,9 +178,10 @@ def _may_be_silhouette(rows: EdgeRows, corners: list[mi.Vector4f]) -> mi.Bool:
 def _leaves_scene(rows: EdgeRows, corners: list[mi.Vector4f], box: mi.ScalarBoundingBox3f) -> mi.Bool:
     """Does the shadow of the edge miss everything, because it starts on the scene's bounding box and leads out?"""
     leaves = mi.Bool(False)
+    lower, upper = (dr.opaque(mi.Point3f, list(corner)) for corner in (box.min, box.max))  # the scene may grow
     for axis in range(3):
-        for sign, face in ((-1, box.min[axis]), (1, box.max[axis])):
-            margin = IN_PLANE * (abs(face) + box.extents()[axis])
+        for sign, face in ((-1, lower[axis]), (1, upper[axis])):
+            margin = IN_PLANE * (dr.abs(face) + upper[axis] - lower[axis])
             outward = (dr.abs(rows.p0[axis] - face) <= margin) & (dr.abs(rows.p1[axis] - face) <= margin)
             for c in corners:
                 outward &= sign * (c[axis] - c.w * face) < -margin  # the light is on the inner side

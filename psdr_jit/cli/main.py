@@ -38,6 +38,7 @@ COMMANDS = {
     "gradient": Command(
         "psdr_jit.cli.gradient", "differentiate a scene by one of its parameters", renders=True
     ),
+    "optimize": Command("psdr_jit.cli.optimize", "recover parameters of a scene from images", renders=True),
     "plan": Command("psdr_jit.cli.plan", "show what differentiating a scene would compute, and why", renders=True),
     "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
     "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),

@@ -1,0 +1,184 @@
+"""Suite `inverse`: the optimisations of `scenes/inverse`, from their own start and from two random ones.
+
+A row tells how far the variables are from the truth at the start and at the end, beside what counts as solved. The peer
+runs the same loop with the same settings for the time that ours took; its learning rates decay over as many iterations
+as fit into it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from benchmarks import rows
+from benchmarks.distances import chamfer
+from benchmarks.suites import Settings
+from psdr_jit.errors import PsdrError
+from psdr_jit.inverse import config, loop
+
+NAME = "inverse"
+BUDGET = 600.0  # [s] longest run
+FOLDER = rows.ROOT / "scenes" / "inverse"
+OURS, PEER = "psdr_path", "prb_projective"
+STARTS = {"": None, ", start 1": 1, ", start 2": 2}
+TRIAL = 3  # iterations of the peer that tell its speed, the first not counted
+FEWEST = 3  # iterations that the peer gets at least
+
+
+@dataclass(frozen=True)
+class Example:
+    """`figures(problem, latents)`: what is measured, by name with unit; `limits`: below which it is solved.
+
+    A limit is a number, or a function of the figure at the start.
+    """
+
+    file: str
+    figures: Callable[[Any, Any], dict[str, float]]
+    limits: dict[str, Callable[[float], float]]
+
+
+def below(value: float) -> Callable[[float], float]:
+    return lambda start: value
+
+
+def tenth(start: float) -> float:
+    return start / 10
+
+
+def offset(parameter: str, kind: str, size: float = 1.0) -> Callable[[Any, Any], float]:
+    return lambda problem, latents: problem.offsets(latents)[parameter][kind] / size
+
+
+def named(**figures: Callable[[Any, Any], float]) -> Callable[[Any, Any], dict[str, float]]:
+    return lambda problem, latents: {name: figure(problem, latents) for name, figure in figures.items()}
+
+
+def distance_to_knob(problem: Any, latents: Any) -> float:
+    """Chamfer distance of the body to the mesh that the targets show."""
+    body = problem.params.properties["body.vertex_positions"][2]
+    positions = np.array(problem.variables["body.vertex_positions"].value(latents["body.vertex_positions"]))
+    faces = np.array(mi.traverse(body)["faces"]).reshape(-1, 3)
+    knob = mi.traverse(mi.load_dict({"type": "ply", "filename": str(FOLDER.parent / "meshes" / "knob.ply")}))
+    other = np.array(knob["vertex_positions"]).reshape(-1, 3), np.array(knob["faces"]).reshape(-1, 3)
+    return chamfer((positions.reshape(-1, 3), faces), other)
+
+
+CAMERA, LAMP, BLOCKER = "camera.to_world", "lamp.position", "blocker.vertex_positions"
+CAMERA_SIZE = 4.3  # [units] from the camera to the middle of the boxes
+SHADOW_SIZE = 3.0  # [units] from the lamp to the floor
+
+EXAMPLES = {
+    "rotation": Example(
+        "rotation", named(angle_degrees=offset("tree.vertex_positions", "angle_degrees")), {"angle_degrees": below(0.1)}
+    ),
+    "profile": Example("profile", named(rms=offset("prism.vertex_positions", "rms")), {"rms": tenth}),
+    "camera": Example(
+        "camera",
+        named(angle_degrees=offset(CAMERA, "angle_degrees"), distance=offset(CAMERA, "distance", CAMERA_SIZE)),
+        {"angle_degrees": below(0.2), "distance": below(0.005)},
+    ),
+    "reconstruction": Example("reconstruction", named(chamfer=distance_to_knob), {"chamfer": tenth}),
+    "shadow": Example(
+        "shadow",
+        named(lamp=offset(LAMP, "distance", SHADOW_SIZE), blocker=offset(BLOCKER, "distance", SHADOW_SIZE)),
+        {"lamp": below(0.01), "blocker": below(0.01)},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Opened:
+    """One example and start."""
+
+    name: str
+    example: Example
+    config: config.Config
+    settings: Settings
+
+
+def case_names() -> list[str]:
+    return [name + start for name in EXAMPLES for start in STARTS]
+
+
+def quick_case_names() -> list[str]:
+    return []
+
+
+def method_names(case: str) -> list[str]:
+    return [OURS, PEER]
+
+
+def open_case(name: str, settings: Settings) -> Opened:
+    example, _, start = name.partition(",")
+    perturb = STARTS["," + start if start else ""]
+    found = config.read(FOLDER / f"{EXAMPLES[example].file}.toml", max_seconds=settings.budget)
+    found = replace(found, settings=replace(found.settings, perturb=perturb))
+    return Opened(name, EXAMPLES[example], found, settings)
+
+
+def measure(opened: Opened, method_name: str) -> dict[str, Any]:
+    """The row of one run, without circumstances."""
+    row = {"bench": NAME, "case": opened.name, "method": method_name, "family": opened.example.file}
+    try:
+        chosen = opened.config if method_name == OURS else peer_of(opened)
+        found, folder = run(opened, chosen)
+    except (PsdrError, RuntimeError, TypeError) as error:
+        return {**row, "settings": {}, "status": "cannot", "error": f"{type(error).__name__}: {str(error)[:200]}"}
+    if method_name == OURS and opened.config.settings.perturb is None:
+        keep_pictures(opened, folder)
+    shutil.rmtree(folder)
+    return {**row, **found}
+
+
+def peer_of(opened: Opened) -> config.Config:
+    """The peer with as many iterations as fit into our time."""
+    stored = rows.read([opened.settings.folder / f"{NAME}.jsonl"])
+    ours = [r for r in stored if r["case"] == opened.name and r["method"] == OURS and r["status"] == "ok"]
+    if not ours:
+        raise PsdrError(f"there is no row of {OURS} whose time could be given to {PEER}")
+    seconds = ours[-1]["seconds"]
+    chosen = config.with_integrator(opened.config, PEER)
+    chosen = replace(chosen, integrator={**chosen.integrator, "guiding": "none"})
+    problem = config.problem_of(replace(chosen, settings=replace(chosen.settings, iterations=TRIAL, max_seconds=None)))
+    times: list[float] = [time.perf_counter()]
+    loop.run(problem, progress=lambda *_: times.append(time.perf_counter()))
+    each = float(np.median(np.diff(times)[1:]))
+    count = max(FEWEST, min(chosen.settings.iterations, int(seconds / each)))
+    return replace(chosen, settings=replace(chosen.settings, iterations=count, max_seconds=None))
+
+
+def run(opened: Opened, chosen: config.Config) -> tuple[dict[str, Any], Path]:
+    """Figures before and after, and the folder with the pictures."""
+    problem = config.problem_of(chosen)
+    figures = opened.example.figures
+    before = figures(problem, problem.start())
+    folder = Path(tempfile.mkdtemp(prefix="psdr-inverse-"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = loop.run(problem, folder)
+    after = figures(problem, result.latents)
+    limits = {name: limit(before[name]) for name, limit in opened.example.limits.items()}
+    return {
+        "settings": {"iterations": chosen.settings.iterations, "spp": chosen.settings.spp,
+                     "perturb": chosen.settings.perturb, "integrator": dict(chosen.integrator)},
+        "status": "ok", "ended": result.status, "seeds": 1, "seconds": result.seconds, "iterations": result.iterations,
+        "loss": result.loss, "before": before, "after": after, "limits": limits,
+        "solved": all(after[name] < limit for name, limit in limits.items()),
+    }, folder  # fmt: skip
+
+
+def keep_pictures(opened: Opened, folder: Path) -> None:
+    """The strip of images of a run from the example's own start."""
+    into = opened.settings.folder / NAME
+    into.mkdir(parents=True, exist_ok=True)
+    for name in ("result", "curves"):
+        shutil.copyfile(folder / f"{name}.png", into / f"{opened.example.file}_{name}.png")

@@ -1,0 +1,70 @@
+"""Recover parameters of a scene from images, as a TOML file says.
+
+Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
+checkpoint; --resume goes on from it with the same seeds and moments. Exit status 1: the loss diverged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from psdr_jit.cli import _common
+
+NAME = "optimize"
+HELP = "recover parameters of a scene from images"
+
+OK, DIVERGED, INTERRUPTED = 0, 1, 130
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", metavar="CONFIG.toml", help="what to optimise; see README")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: out/ and the name of the file)")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
+    parser.add_argument("--iterations", type=int, metavar="N", help="instead of those in the file")
+    parser.add_argument("--max-seconds", type=float, metavar="S", help="stop after this time")
+    parser.add_argument("--perturb", type=int, metavar="SEED", help="displace the start at random, within its spread")
+    parser.add_argument(
+        "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
+    )
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    parser.add_argument("--quiet", action="store_true", help="print only errors and warnings")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check, optimise, report."""
+    from psdr_jit import scene_io
+    from psdr_jit.errors import OptionError
+    from psdr_jit.inverse import config as configs
+    from psdr_jit.inverse import loop
+
+    scene_io.use_variant(args.variant)
+    given = {"iterations": args.iterations, "max_seconds": args.max_seconds, "perturb": args.perturb}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    config = configs.read(args.config, **changes)
+    if args.integrator:
+        config = configs.with_integrator(config, args.integrator)
+    out = args.out or Path("out") / Path(args.config).stem
+    if not args.resume and (out / "checkpoint.npz").exists():
+        raise OptionError(
+            f"'{out}' holds an earlier run: go on with it by --resume, or choose another folder with --out"
+        )
+    problem = configs.problem_of(config)
+    start = time.perf_counter()
+    with _common.progress_bar("optimize", args.quiet) as report:
+        result = loop.run(problem, out, args.resume, report)
+    if not args.quiet:
+        print(describe(result, out, time.perf_counter() - start))
+    return {loop.DIVERGED: DIVERGED, loop.INTERRUPTED: INTERRUPTED}.get(result.status, OK)
+
+
+def describe(result: Any, out: Path, seconds: float) -> str:
+    """What became of the run, in a few lines."""
+    lines = [f"{result.status} after {result.iterations} iterations, {seconds:.1f} s; loss {result.loss:.3e}"]
+    for name, now in result.offsets.items():
+        for kind, value in now.items():
+            lines.append(f"  {name}: {kind} from the scene file {result.start_offsets[name][kind]:.4g} -> {value:.4g}")
+    resume = "; go on with --resume" if result.status == "interrupted" else ""
+    return "\n".join([*lines, f"log, pictures and values are in {out}{resume}"])

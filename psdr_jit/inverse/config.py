@@ -1,0 +1,201 @@
+"""`psdr optimize CONFIG.toml`: a file that describes an optimisation. Everything wrong with it is reported at once.
+
+scene = "scene.xml"               # relative to this file
+loss = "l2"                       # l1, l2, relative_l2, dual_l2
+iterations = 100                  # and every other field of `Settings`
+
+[defaults]                        # <default> values of the scene file
+res = 64
+
+[integrator]                      # properties; psdr_path and the scene's path lengths unless given
+max_depth = 3
+
+[optimizer]                       # adam, adamw, sgd or rmsprop, and its options
+type = "adam"
+
+[[target]]                        # one or more
+sensor = 0                        # index, or a list of them (default: the number of the target)
+file = "photo.exr"                # or rendered:
+render = 256                      # samples per pixel, of the scene as its file says,
+scene = "other.xml"               # or of another scene, with <default> values of its own
+defaults = { mesh = "other.ply" }
+
+[[variable]]                      # one or more: "parameter", "pose", "vertices" or "profile"
+kind = "pose"
+parameter = "box.vertex_positions"
+learning_rate = 0.01              # and the other fields of that class
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from psdr_jit import integrators, scene_io
+from psdr_jit.errors import OptionError
+from psdr_jit.inverse.losses import LOSSES
+from psdr_jit.inverse.problem import Problem, make_problem
+from psdr_jit.inverse.settings import Settings
+from psdr_jit.inverse.shapes import Profile, Vertices
+from psdr_jit.inverse.targets import rendered
+from psdr_jit.inverse.variables import Parameter, Pose
+
+KINDS = {"parameter": Parameter, "pose": Pose, "vertices": Vertices, "profile": Profile}
+TABLES = ("scene", "loss", "defaults", "integrator", "target", "variable")
+TARGET_KEYS = {"sensor": (int, list), "file": str, "render": int, "scene": str, "defaults": Mapping}
+EXPECTED = {int: "a whole number", str: "a text", Mapping: "a table", (int, list): "an index or a list of them"}
+
+
+@dataclass(frozen=True)
+class Config:
+    """A checked file; paths are absolute."""
+
+    path: Path
+    scene: Path
+    loss: str
+    defaults: Mapping[str, Any]
+    integrator: Mapping[str, Any]
+    targets: tuple[Mapping[str, Any], ...]
+    variables: tuple[Any, ...]
+    settings: Settings
+
+
+def read(path: str | Path, **changes: Any) -> Config:
+    """Parse and check a file; `changes` replace settings. Raises `OptionError` with all that is wrong with it."""
+    try:
+        import tomllib
+    except ModuleNotFoundError:  # Python 3.10
+        import tomli as tomllib
+
+    path = Path(path)
+    if not path.is_file():
+        raise OptionError(f"'{path}' does not exist: check the path")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"'{path}' is not valid TOML: {error}") from error
+    wrong: list[str] = []
+    config = _checked(path, {**content, **changes}, wrong)
+    if wrong:
+        listed = "".join(f"\n  - {text}" for text in wrong)
+        raise OptionError(f"'{path}' has {len(wrong)} mistake{'s' if len(wrong) > 1 else ''}:{listed}")
+    return config
+
+
+def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config | None:
+    setting_names = [f.name for f in fields(Settings)]
+    _unknown("", content, [*TABLES, *setting_names], wrong)
+    for name in ("defaults", "integrator", "optimizer"):
+        if not isinstance(content.get(name, {}), Mapping):
+            wrong.append(f"{name} must be a table: [{name}]")
+    for name in ("target", "variable"):
+        if not isinstance(content.get(name), list) or not all(isinstance(x, Mapping) for x in content[name]):
+            wrong.append(f"there must be at least one [[{name}]]")
+    scene = path.parent / str(content.get("scene", ""))
+    if "scene" not in content:
+        wrong.append('scene = "..." is missing')
+    elif not scene.is_file():
+        wrong.append(f"scene = \"{content['scene']}\": there is no file '{scene}'")
+    loss = content.get("loss", "l2")
+    if loss not in LOSSES:
+        wrong.append(f"loss = {loss!r}: expected one of {', '.join(LOSSES)}")
+    targets = [_target(path, k, t, wrong) for k, t in enumerate(_tables(content, "target"))]
+    variables = [_variable(k, v, wrong) for k, v in enumerate(_tables(content, "variable"))]
+    try:
+        settings = Settings(**{name: content[name] for name in setting_names if name in content})
+    except OptionError as error:
+        wrong += str(error).split("; ")
+        return None
+    integrator = {"type": integrators.DEFAULT_INTEGRATOR, **content.get("integrator", {})}
+    return Config(
+        path, scene, loss, content.get("defaults", {}), integrator, tuple(targets), tuple(variables), settings
+    )
+
+
+def _tables(content: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    found = content.get(name)
+    return [x for x in found if isinstance(x, Mapping)] if isinstance(found, list) else []
+
+
+def _unknown(where: str, table: Mapping[str, Any], known: list[str], wrong: list[str]) -> None:
+    for key in table:
+        if key not in known:
+            close = difflib.get_close_matches(key, known, n=1)
+            wrong.append(f"{where}there is no key '{key}'{f'; did you mean {close[0]!r}?' if close else ''}")
+
+
+def _target(path: Path, k: int, table: Mapping[str, Any], wrong: list[str]) -> dict[str, Any]:
+    where = f"[[target]] {k + 1}: "
+    _unknown(where, table, list(TARGET_KEYS), wrong)
+    for key, kind in TARGET_KEYS.items():
+        if key in table and (not isinstance(table[key], kind) or isinstance(table[key], bool)):
+            wrong.append(f"{where}{key} = {table[key]!r}: expected {EXPECTED[kind]}")
+            return {}
+    if ("file" in table) == ("render" in table):
+        wrong.append(f"{where}give either file or render, the samples per pixel")
+    for key in ("scene", "defaults"):
+        if key in table and "render" not in table:
+            wrong.append(f"{where}{key} is for rendered targets: give render as well")
+    if table.get("render", 1) < 1:
+        wrong.append(f"{where}render = {table['render']}: expected at least one sample per pixel")
+    return _with_paths(path, table, where, k, wrong)
+
+
+def _with_paths(path: Path, table: Mapping[str, Any], where: str, k: int, wrong: list[str]) -> dict[str, Any]:
+    """With a list of sensors and absolute paths of files, which must exist."""
+    sensors = table.get("sensor", k)
+    found = {**table, "sensor": sensors if isinstance(sensors, list) else [sensors]}
+    if "file" in table and len(found["sensor"]) != 1:
+        wrong.append(f"{where}a file is the target of one sensor")
+    for key in ("file", "scene"):
+        if key in table:
+            found[key] = path.parent / table[key]
+            if not found[key].is_file():
+                wrong.append(f"{where}there is no file '{found[key]}'")
+    return found
+
+
+def _variable(k: int, table: Mapping[str, Any], wrong: list[str]) -> Any:
+    where = f"[[variable]] {k + 1}: "
+    kind = KINDS.get(table.get("kind"))
+    if kind is None:
+        wrong.append(f"{where}kind = {table.get('kind')!r}: expected one of {', '.join(KINDS)}")
+        return None
+    own = [f for f in fields(kind) if f.init]
+    _unknown(where, table, ["kind", *(f.name for f in own)], wrong)
+    missing = [f.name for f in own if f.default is MISSING and f.default_factory is MISSING and f.name not in table]
+    if missing:
+        wrong.append(f"{where}{' and '.join(missing)} must be given")
+        return None
+    numeric = [f.name for f in own if f.type == "float"]
+    for name in numeric:
+        if name in table and (not isinstance(table[name], (int, float)) or isinstance(table[name], bool)):
+            wrong.append(f"{where}{name} = {table[name]!r}: expected a number")
+    return kind(**{f.name: table[f.name] for f in own if f.name in table})
+
+
+def problem_of(config: Config) -> Problem:
+    """Load the scene, render or read the targets. Raises what loading and checking raise."""
+    scene = scene_io.load_scene(config.scene, **config.defaults)
+    integrator = integrators.build(integrators.integrator_spec(scene, config.integrator))
+    path = integrators.reference(integrators.integrator_spec(scene, config.integrator))
+    targets: dict[int, Any] = {}
+    for target in config.targets:
+        source = scene
+        if "scene" in target or "defaults" in target:
+            defaults = {**config.defaults, **target.get("defaults", {})}
+            source = scene_io.load_scene(target.get("scene", config.scene), **defaults)
+        for sensor in target["sensor"]:
+            if sensor in targets:
+                raise OptionError(f"'{config.path}': sensor {sensor} has two targets")
+            targets[sensor] = target["file"] if "file" in target else rendered(source, sensor, path, target["render"])
+    return make_problem(scene, config.variables, targets, config.loss, integrator, config.settings)
+
+
+def with_integrator(config: Config, plugin: str) -> Config:
+    """The same with another integrator, which keeps the path lengths of the first."""
+    kept = {key: config.integrator[key] for key in integrators.PATH_OPTIONS if key in config.integrator}
+    return replace(config, integrator={"type": plugin, **kept})

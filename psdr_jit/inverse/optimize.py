@@ -1,0 +1,55 @@
+"""The public way to recover parameters of a scene from images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from psdr_jit.errors import OptionError
+from psdr_jit.inverse import loop
+from psdr_jit.inverse.problem import make_problem
+from psdr_jit.inverse.settings import Settings
+from psdr_jit.inverse.variables import Variable
+
+
+def optimize(
+    scene: mi.Scene,
+    variables: Variable | Sequence[Variable],
+    targets: Any,
+    *,
+    loss: Any = "l2",
+    integrator: Any = None,
+    out: str | os.PathLike | None = None,
+    resume: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+    **settings: Any,
+) -> loop.Result:
+    """Change `variables` of `scene` until its sensors see `targets`; the scene is left at what was found.
+
+    `variables`: `Parameter`, `Pose`, `Vertices`, `Profile`, or objects of your own with the methods of
+    `inverse.variables.Variable`. `targets`: one image (H, W, C) of linear radiance for the first sensor, a list with
+    one per sensor, or a dict by sensor index; arrays, Dr.Jit tensors, or names of image files. `loss`: "l1", "l2",
+    "relative_l2", "dual_l2", a function of (image, target) that returns one number, or an `inverse.losses.Loss`.
+    `integrator`: as in `gradient`: an integrator, a dict of its properties, a plugin name, or None for `psdr_path` with
+    the scene's own path lengths. `settings`: fields of `inverse.settings.Settings`, such as `iterations`, `spp`,
+    `views_per_step`, `seed`, `decay`.
+
+    With a folder `out`: a log, checkpoints, snapshots, pictures, and the final values are written there, and
+    `resume=True` goes on where an interrupted run of the same problem stopped, with the seeds and the moments that it
+    would have had. Ctrl-C ends the iteration, writes a checkpoint and returns.
+    `progress(done, total, note)` is called after every iteration.
+
+    Raises `ParameterError`, `OptionError`, `SceneError` or `UnsupportedError` before the first iteration. Warns
+    (`StalledWarning`) where the loss does not depend on a variable, and of a loss that diverges; the run then ends and
+    the best state is kept.
+    """
+    known = set(Settings.__dataclass_fields__)
+    unknown = sorted(set(settings) - known)
+    if unknown:
+        raise OptionError(f"there is no setting {', '.join(map(repr, unknown))}; there are {', '.join(sorted(known))}")
+    problem = make_problem(scene, variables, targets, loss, integrator, Settings(**settings))
+    return loop.run(problem, None if out is None else Path(out), resume, progress)

@@ -1,0 +1,181 @@
+"""One optimisation as a whole: scene, views, variables, loss. Evaluates loss and gradient, and does not step."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from psdr_jit import integrators
+from psdr_jit.errors import OptionError, ParameterError
+from psdr_jit.inverse.losses import Loss, find_loss
+from psdr_jit.inverse.settings import Settings
+from psdr_jit.inverse.targets import View, views
+from psdr_jit.inverse.variables import Variable, numbers
+from psdr_jit.params import values_to_keep
+
+Latents = dict[str, dict[str, Any]]  # by parameter, by latent
+
+#: What a seed is for; the iteration, the view and this make it.
+TARGET_IMAGE, SECOND_IMAGE, GRADIENT = range(3)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene whose `variables` are to make every sensor see its target."""
+
+    scene: mi.Scene
+    params: Any
+    views: tuple[View, ...]
+    variables: dict[str, Variable]  # by parameter
+    loss: Loss
+    integrator: Any
+    settings: Settings
+    own: Latents  # at the scene's own values
+
+    def chosen(self, iteration: int) -> list[int]:
+        """Views of an iteration: all, or the next few of a random order that is drawn anew for each round."""
+        count, few = len(self.views), self.settings.views_per_step
+        if few == 0 or few >= count:
+            return list(range(count))
+        picked = []
+        for k in range(iteration * few, (iteration + 1) * few):
+            order = np.random.default_rng((self.settings.seed, k // count)).permutation(count)
+            picked.append(int(order[k % count]))
+        return picked
+
+    def seed(self, iteration: int, view: int, purpose: int) -> int:
+        """A seed for Mitsuba's samplers."""
+        state = np.random.SeedSequence((self.settings.seed, iteration, view, purpose)).generate_state(1)
+        return int(state[0])
+
+    def apply(self, latents: Mapping[str, Mapping[str, Any]]) -> None:
+        """Put the scene where the latents say; attached if they are."""
+        for name, variable in self.variables.items():
+            self.params[name] = variable.value(latents[name])
+            self.params.set_dirty(name)  # equal values are skipped, but an attached one must replace a detached one
+        self.params.update()
+
+    def evaluate(self, iteration: int, attached: bool = True) -> tuple[float, dict[int, np.ndarray]]:
+        """Loss of the views of an iteration and, if `attached`, its gradient, added to that of the scene's parameters.
+
+        All views see one state of the scene. Their gradients meet in its parameters, and only then go on to the
+        latents: else the first view would use up the graph between them.
+        """
+        total, images = 0.0, {}
+        chosen = self.chosen(iteration)
+        with dr.isolate_grad():
+            for k in chosen:
+                loss, image, grad = self._view(iteration, k)
+                total += loss / len(chosen)
+                images[k] = image
+                if attached:
+                    self.integrator.render_backward(
+                        self.scene, self.params, grad / len(chosen), sensor=self.views[k].sensor,
+                        seed=self.seed(iteration, k, GRADIENT), spp=self.settings.gradient_spp or self.settings.spp,
+                    )  # fmt: skip
+        return total, images
+
+    def _view(self, iteration: int, k: int) -> tuple[float, np.ndarray, mi.TensorXf]:
+        """Loss of one view, its image, and the derivative of the loss by the image."""
+        view = self.views[k]
+        images = []
+        with dr.suspend_grad():
+            for purpose in (TARGET_IMAGE, SECOND_IMAGE)[: self.loss.images]:
+                image = self.integrator.render(self.scene, view.sensor, seed=self.seed(iteration, k, purpose),
+                                               spp=self.settings.spp)  # fmt: skip
+                images.append(mi.TensorXf(dr.detach(image)))
+        dr.enable_grad(images)
+        loss = self.loss.function(*images, view.target)
+        if not dr.is_array_v(loss) or dr.width(loss) != 1:
+            raise ParameterError(
+                f"the loss '{self.loss.name}' returned {type(loss).__name__} with {dr.width(loss)} "
+                "numbers: expected one, such as dr.mean(..., axis=None)"
+            )
+        dr.backward(loss)
+        grad = sum(dr.grad(image) for image in images)
+        dr.eval(loss, grad)
+        return float(np.ravel(np.array(dr.detach(loss)))[0]), np.array(dr.detach(images[0])), grad
+
+    def offsets(self, latents: Latents) -> dict[str, dict[str, float]]:
+        """How far every variable is from the scene's own value."""
+        return {name: variable.offset(latents[name]) for name, variable in self.variables.items()}
+
+    def start(self) -> Latents:
+        """Latents to start from."""
+        seed = self.settings.perturb
+        found = {}
+        for k, (name, variable) in enumerate(self.variables.items()):
+            rng = None if seed is None else np.random.default_rng((seed, k))
+            found[name] = variable.start(self.own[name], rng)
+        return found
+
+    def fingerprint(self) -> str:
+        """Changes with whatever makes a stored state meaningless."""
+        digest = hashlib.sha256()
+        ignored = {"iterations", "checkpoint_every", "snapshot_every", "max_seconds"}  # may change on resuming
+        settings = {key: value for key, value in asdict(self.settings).items() if key not in ignored}
+        kinds = {name: type(v).__name__ for name, v in self.variables.items()}
+        rates = {name: dict(v.learning_rates) for name, v in self.variables.items()}
+        digest.update(json.dumps([settings, kinds, rates, self.loss.name, str(self.integrator)], sort_keys=True,
+                                 default=str).encode())  # fmt: skip
+        for view in self.views:
+            digest.update(np.array(view.target).tobytes())
+        for latents in self.own.values():
+            for value in latents.values():
+                digest.update(numbers(value).tobytes())
+        return digest.hexdigest()
+
+
+def make_problem(
+    scene: mi.Scene,
+    variables: Sequence[Variable] | Variable,
+    targets: Any,
+    loss: Any,
+    integrator: Any,
+    settings: Settings,
+) -> Problem:
+    """Everything checked; raises typed errors before anything is rendered in a loop."""
+    if not isinstance(scene, mi.Scene):
+        raise ParameterError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    chosen = list(variables) if isinstance(variables, Sequence) else [variables]
+    names = [v.parameter for v in chosen]
+    if not chosen:
+        raise OptionError("there is no variable: name at least one scene parameter to optimise")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
+    found = tuple(views(scene, targets))
+    params = mi.traverse(scene)
+    own = {v.parameter: v.begin(scene, params) for v in chosen}
+    for variable in chosen:
+        for latent, rate in variable.learning_rates.items():
+            if not rate > 0:
+                raise OptionError(
+                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
+                )
+    if not hasattr(integrator, "render_backward"):
+        integrator = integrators.build(integrators.integrator_spec(scene, integrator))
+    problem = Problem(
+        scene, params, found, {v.parameter: v for v in chosen}, find_loss(loss), integrator, settings, own
+    )
+    return problem
+
+
+def with_settings(problem: Problem, **changes: Any) -> Problem:
+    """The same problem, run in another way."""
+    return replace(problem, settings=replace(problem.settings, **changes))
+
+
+def scene_values(problem: Problem) -> dict[str, Any]:
+    """Copies of what the variables change in the scene."""
+    kept = {}
+    for name in problem.variables:
+        kept |= values_to_keep(problem.params, name)
+    return kept

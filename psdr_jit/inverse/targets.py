@@ -1,0 +1,114 @@
+"""What the images should become: files, arrays, or renders of a scene; checked before anything is optimised."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from psdr_jit.errors import OptionError, ParameterError
+from psdr_jit.scene_io import find_sensor
+from psdr_jit.upload import uploaded
+
+#: Seed of rendered targets: far from those that a loop counts up from 0.
+TARGET_SEED = 0x7A26E7
+
+#: Samples per pixel of a target that are rendered at once.
+PASS = 256
+
+
+@dataclass(frozen=True)
+class View:
+    """A sensor of the scene, and the image (H, W, C) that it should see."""
+
+    sensor: mi.Sensor
+    target: mi.TensorXf
+    name: str
+
+
+def view(scene: mi.Scene, sensor: Any, target: Any) -> View:
+    """A view after its checks. `target`: array (H, W, C), Dr.Jit tensor, or the path of an image file.
+
+    Files hold linear radiance (EXR, PFM, HDR) or are converted to it (PNG, JPEG). Raises `ParameterError` for images of
+    another size and for values that are not finite, `OptionError` for files that cannot be read.
+    """
+    found = find_sensor(scene, sensor)
+    name = sensor_name(scene, found)
+    what = f"the target of sensor '{name}'"
+    if isinstance(target, (str, os.PathLike)):
+        what, target = f"{what}, '{target}',", read_image(target)
+    image = np.asarray(target, dtype=np.float32)
+    image = image[..., None] if image.ndim == 2 else image
+    expected = image_shape(found)
+    if image.shape != expected:
+        raise ParameterError(
+            f"{what} has the shape {image.shape}, but the sensor renders {expected}: resize the target, "
+            "or set the film's width, height and pixel format"
+        )
+    bad = int(np.count_nonzero(~np.isfinite(image)))
+    if bad:
+        raise ParameterError(
+            f"{what} has {bad} of {image.size} values that are not finite (NaN or infinite): repair the "
+            "image; one such pixel makes every gradient NaN"
+        )
+    return View(found, mi.TensorXf(uploaded(mi.Float, image), image.shape), name)
+
+
+def views(scene: mi.Scene, targets: Any) -> list[View]:
+    """`targets`: one image for the first sensor, a list with one image per sensor, or a dict by sensor index."""
+    if isinstance(targets, (str, os.PathLike)) or hasattr(targets, "shape"):
+        pairs = [(0, targets)]
+    elif isinstance(targets, dict):
+        pairs = list(targets.items())
+    elif isinstance(targets, Sequence):
+        pairs = list(enumerate(targets))
+    else:
+        raise ParameterError(f"targets must be an image, a list or a dict of images, got {type(targets).__name__}")
+    if not pairs:
+        raise ParameterError("there is no target: give an image for at least one sensor")
+    return [view(scene, sensor, target) for sensor, target in pairs]
+
+
+def rendered(scene: mi.Scene, sensor: Any, integrator: Any, spp: int) -> np.ndarray:
+    """The image (H, W, C) of a scene as it stands, with `spp` samples per pixel."""
+    found = find_sensor(scene, sensor)
+    total, done = 0.0, 0
+    while done < spp:
+        part = min(PASS, spp - done)
+        with dr.suspend_grad():
+            image = integrator.render(scene, found, seed=TARGET_SEED + done, spp=part)
+        total = total + np.array(image, dtype=np.float64) * part
+        done += part
+    return total / spp
+
+
+def image_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
+    """(H, W, C) of what a sensor renders."""
+    film = sensor.film()
+    width, height = film.crop_size()
+    film.prepare([])
+    return int(height), int(width), int(film.develop().shape[2])
+
+
+def sensor_name(scene: mi.Scene, sensor: mi.Sensor) -> str:
+    """Its id, or its number where it has none."""
+    if sensor.id() and not sensor.id().startswith("_"):
+        return sensor.id()
+    return next((str(k) for k, s in enumerate(scene.sensors()) if s is sensor), "sensor")
+
+
+def read_image(path: str | os.PathLike) -> np.ndarray:
+    """An image file as linear values (H, W, C)."""
+    if not Path(path).is_file():
+        raise OptionError(f"image file '{path}' does not exist: check the path")
+    try:
+        bitmap = mi.Bitmap(os.fspath(path))
+        return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
+    except RuntimeError as error:
+        raise OptionError(f"image file '{path}' cannot be read: {str(error).splitlines()[-1].strip()}") from error

@@ -1,0 +1,32 @@
+"""From NumPy to the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+#: Bytes to which Dr.Jit aligns its own memory.
+ALIGNMENT = 64
+
+
+def uploaded(kind: type, values: np.ndarray) -> Any:
+    """A flat Dr.Jit array of type `kind` (32-bit indices, floats or masks) with these values.
+
+    On the CPU, Dr.Jit adopts NumPy's memory and compiles other kernels if it does not happen to be aligned.
+    """
+    values = np.asarray(values, _numpy_type(kind))
+    memory = np.empty(values.nbytes + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    aligned = memory[start : start + values.nbytes].view(values.dtype)
+    aligned[:] = values.ravel()
+    return kind(aligned)
+
+
+def _numpy_type(kind: type) -> Any:
+    if dr.is_mask_v(kind):
+        return np.bool_
+    if dr.is_float_v(kind):
+        return np.float64 if dr.type_v(kind) == dr.VarType.Float64 else np.float32
+    return np.uint32
