@@ -7,6 +7,7 @@ import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
 from psdr_jit import film as films
+from psdr_jit.batch import parts_of, share, side_by_side, splits
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
 from psdr_jit.plan import Plan
@@ -34,7 +35,11 @@ class TermIntegrator(ADIntegrator):
         )
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        return self._path.render(scene, sensor, seed, spp, develop, evaluate)
+        view = find_sensor(scene, sensor)
+        if not splits(view):
+            return self._path.render(scene, view, seed, spp, develop, evaluate)
+        parts = parts_of(view, seed, spp)
+        return side_by_side([self._path.render(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
 
     def call(self, scene, sensor, seed, spp, mode="forward") -> Call:
         """A render call of this integrator as data."""
@@ -48,12 +53,23 @@ class TermIntegrator(ADIntegrator):
         return prepared
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        view = find_sensor(scene, sensor)
+        if splits(view):
+            parts = parts_of(view, seed, spp)
+            return side_by_side([self.render_forward(scene, params, p.sensor, p.seed, p.spp) for p in parts])
         prepared = self._prepared(scene, sensor, seed, spp, "forward")
         images = {term.name: term.forward(job) for term, job in prepared.jobs}
         prepared.observe(seed, images)
         return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        view = find_sensor(scene, sensor)
+        if splits(view):
+            _require_gradient_image(grad_in, films.black(view.film()).shape)
+            parts = parts_of(view, seed, spp)
+            for k, p in enumerate(parts):
+                self.render_backward(scene, params, share(grad_in, k, len(parts)), p.sensor, p.seed, p.spp)
+            return
         prepared = self._prepared(scene, sensor, seed, spp, "backward")
         _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
         for term, job in prepared.jobs:

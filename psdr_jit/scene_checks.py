@@ -43,8 +43,7 @@ class Finding:
 def require_supported(facts: SceneFacts) -> None:
     """Raise if the derivative of this scene would be wrong, warn if a part of it is missing.
 
-    All errors go into one message, under the type of the first. A warning is shown once per text, as Python
-    does by default; the text names the shape or emitter.
+    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter.
     """
     found = list(findings(facts))
     errors = [finding for finding in found if finding.is_error]
@@ -104,7 +103,8 @@ def check_media(facts: SceneFacts) -> Iterator[Finding]:
 def check_sensor(facts: SceneFacts) -> Iterator[Finding]:
     """Moving edges must be projected onto the film."""
     if facts.geometry_moves and facts.sensor.plugin not in SUPPORTED_SENSORS:
-        way_out = "; render its sensors one at a time" if facts.sensor.plugin == "batch" else ""
+        alike = "; give each of its sensors a film with the rfilter and pixel_format of the batch, and crop none"
+        way_out = alike if facts.sensor.plugin == "batch" else ""
         yield Finding(
             UnsupportedError, facts.sensor.name,
             f"sensor '{facts.sensor.name}' ({facts.sensor.plugin}) has no primary boundary term{way_out}; "

@@ -46,7 +46,7 @@ class SceneGraph:
             params = mi.traverse(sensor)
             self._nodes += params.hierarchy
             self._collect(params, "sensor.")
-        self._children = {id(node): _child_objects(node) for node in self._nodes}
+        self._children = {id(node): child_objects(node) for node in self._nodes}
 
     def _collect(self, params, prefix: str) -> None:
         for name, (_, _, node, _) in params.properties.items():
@@ -94,7 +94,7 @@ class SceneGraph:
 
     def _children_of(self, node: mi.Object) -> list[mi.Object]:
         known = self._children.get(id(node))
-        return _child_objects(node) if known is None else known
+        return child_objects(node) if known is None else known
 
     def shapes_in_groups(self) -> list[mi.Shape]:
         """The shapes that are visible through instances only."""
@@ -107,8 +107,8 @@ class SceneGraph:
         return known if known and not known.startswith("_unnamed_") else f"{plugin_name(node)} #{index}"
 
 
-def _child_objects(node: mi.Object) -> list[mi.Object]:
-    """The objects that `node` refers to directly."""
+def child_objects(node: mi.Object) -> list[mi.Object]:
+    """The objects that `node` refers to directly, in the order in which it names them."""
     return [child for _, child in _named_children(node)]
 
 

@@ -22,7 +22,7 @@ RANK = {
     # host-side descriptions
     "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "llvm_fetch": 1, "scene_io": 1,
-    "params": 2, "scene_probes": 3,
+    "params": 2, "scene_probes": 3, "batch": 4,
     "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
     "intersections": 2, "walk_tangents": 2, "perturbation": 3, "llvm": 2,
     "scene_analysis": 4, "interior": 6, "drjit_libraries": 3,

@@ -59,7 +59,8 @@ class _State:
     iteration: int = 0
     seconds: float = 0.0  # of runs before this one
     first_losses: list[float] = field(default_factory=list)
-    recent: deque = field(default_factory=lambda: deque(maxlen=RECENT))
+    recent: deque = field(default_factory=lambda: deque(maxlen=RECENT))  # losses
+    passed: deque = field(default_factory=lambda: deque(maxlen=RECENT))  # (loss, latents) of the same iterations
     without_gradient: dict[str, int] = field(default_factory=dict)
     norms: dict[str, float] = field(default_factory=dict)  # of the latest gradient
     began: float = field(default_factory=time.perf_counter)
@@ -192,10 +193,11 @@ def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
         warnings.simplefilter("ignore", ZeroDerivativeWarning)  # said once it has lasted, with the variable's name
         loss, images = problem.evaluate(state.iteration)
     state.recent.append(loss)
+    state.passed.append((loss, before))
     if len(state.first_losses) < RECENT:
         state.first_losses.append(loss)
     if np.mean(state.recent) < state.best_loss and len(state.recent) == RECENT:
-        state.best, state.best_loss = before, float(np.mean(state.recent))
+        state.best, state.best_loss = min(state.passed, key=lambda entry: entry[0])[1], float(np.mean(state.recent))
     norms = state.norms = {}
     for name, variable in problem.variables.items():
         opt = state.optimisers[name]
@@ -240,14 +242,14 @@ def _diverges(problem: Problem, state: _State, loss: float) -> bool:
         return True
     if len(state.recent) < RECENT or state.iteration < 2 * RECENT:
         return False
-    return np.mean(state.recent) > problem.settings.diverged_factor * abs(np.mean(state.first_losses))
+    return np.mean(state.recent) > problem.settings.diverged_factor * abs(min(state.first_losses))
 
 
 def _about_divergence(state: _State, loss: float) -> str:
     known = f"the best state (loss {state.best_loss:.3e})" if np.isfinite(state.best_loss) else "the start"
     return (
         f"the loss diverged at iteration {state.iteration} (now {loss:.3e}, at first "
-        f"{np.mean(state.first_losses):.3e}): stopped, {known} is kept; lower the learning rates, or raise spp"
+        f"{min(state.first_losses):.3e}): stopped, {known} is kept; lower the learning rates, or raise spp"
     )
 
 

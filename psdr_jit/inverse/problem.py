@@ -98,6 +98,11 @@ class Problem:
                 f"the loss '{self.loss.name}' returned {type(loss).__name__} with {dr.width(loss)} "
                 "numbers: expected one, such as dr.mean(..., axis=None)"
             )
+        if not dr.grad_enabled(loss):
+            raise ParameterError(
+                f"the loss '{self.loss.name}' does not depend on the image: compute it with Dr.Jit functions "
+                "(NumPy and PyTorch are not tracked; see dr.wrap)"
+            )
         dr.backward(loss)
         grad = sum(dr.grad(image) for image in images)
         dr.eval(loss, grad)

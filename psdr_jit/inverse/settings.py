@@ -29,7 +29,7 @@ class Settings:
     max_seconds: float | None = None
     perturb: int | None = None  # seed of a random displacement of the start
     stalled_after: int = 5  # iterations without a gradient before a warning
-    diverged_factor: float = 10.0  # the run ends if the mean recent loss exceeds that of the start so many times
+    diverged_factor: float = 10.0  # the run ends if the mean recent loss exceeds the first ones so many times
 
     def __post_init__(self) -> None:
         least = {"iterations": 1, "spp": 1, "gradient_spp": 0, "views_per_step": 0, "seed": 0, "checkpoint_every": 1,

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit import images
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.scene_io import find_sensor
 from psdr_jit.upload import uploaded
@@ -41,11 +42,11 @@ def view(scene: mi.Scene, sensor: Any, target: Any) -> View:
     found = find_sensor(scene, sensor)
     name = sensor_name(scene, found)
     what = f"the target of sensor '{name}'"
+    expected = image_shape(found)
     if isinstance(target, (str, os.PathLike)):
-        what, target = f"{what}, '{target}',", read_image(target)
+        what, target = f"{what}, '{target}',", read_image(target, expected[2])
     image = np.asarray(target, dtype=np.float32)
     image = image[..., None] if image.ndim == 2 else image
-    expected = image_shape(found)
     if image.shape != expected:
         raise ParameterError(
             f"{what} has the shape {image.shape}, but the sensor renders {expected}: resize the target, "
@@ -103,12 +104,22 @@ def sensor_name(scene: mi.Scene, sensor: mi.Sensor) -> str:
     return next((str(k) for k, s in enumerate(scene.sensors()) if s is sensor), "sensor")
 
 
-def read_image(path: str | os.PathLike) -> np.ndarray:
-    """An image file as linear values (H, W, C)."""
-    if not Path(path).is_file():
+def read_image(path: str | os.PathLike, channels: int = 3) -> np.ndarray:
+    """An image file as linear values (H, W, C), in 1 (luminance), 3 (RGB) or 4 channels (with alpha).
+
+    Of an EXR file with several layers, the default one counts.
+    """
+    path = Path(path)
+    if not path.is_file():
         raise OptionError(f"image file '{path}' does not exist: check the path")
     try:
-        bitmap = mi.Bitmap(os.fspath(path))
-        return np.array(bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False))
-    except RuntimeError as error:
+        if path.suffix.lower() == ".exr":
+            found = images.read_exr(path)
+            return np.stack([found[name] for name in images.CHANNELS[channels]], axis=-1)
+        formats = mi.Bitmap.PixelFormat
+        wanted = {1: formats.Y, 4: formats.RGBA}.get(channels, formats.RGB)
+        return np.array(mi.Bitmap(os.fspath(path)).convert(wanted, mi.Struct.Type.Float32, srgb_gamma=False))
+    except KeyError as error:
+        raise OptionError(f"image file '{path}' has no channel {error}; it has {', '.join(found)}") from error
+    except (OSError, RuntimeError) as error:
         raise OptionError(f"image file '{path}' cannot be read: {str(error).splitlines()[-1].strip()}") from error

@@ -1,0 +1,113 @@
+"""What is wrong with a problem is said before it runs, all at once, with the way out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from inverse_problems import BOX, box_and_lamp, problem_of, scene_of, target_of, write_config
+
+import psdr_jit
+from psdr_jit import Parameter, Pose, images
+from psdr_jit.cli import main
+from psdr_jit.errors import OptionError, ParameterError
+from psdr_jit.inverse import config
+
+
+def test_every_mistake_of_a_file_is_reported_at_once(llvm, tmp_path):
+    path = write_config(tmp_path, **{
+        "spp = 4": "sppp = 4", "iterations = 20": "iterations = 0", "max_depth": "max_dept",
+        "render = 64": "rendr = 64",
+        "turn_rate = 1.0": "turnrate = 1.0", 'kind = "parameter"': 'kind = "params"',
+        "learning_rate = 0.02": 'learning_rate = "fast"', "res = 16": "res = 16\n[[targets]]",
+    })  # fmt: skip
+    with pytest.raises(OptionError) as caught:
+        config.read(path)
+    text = str(caught.value)
+    for words in ("8 mistakes", "'sppp'; did you mean 'spp'?", "iterations = 0", "'rendr'; did you mean 'render'?",
+                  "either file or render", "'turnrate'; did you mean 'turn_rate'?", "kind = 'params'",
+                  "learning_rate = 'fast': expected a number", "'targets'; did you mean 'target'?"):  # fmt: skip
+        assert words in text, (words, text)
+
+
+def test_files_that_are_not_there(llvm, tmp_path):
+    for old, new, words in (('scene = "/', 'scene = "/nowhere', "there is no file"),
+                            ("render = 64", 'file = "photo.exr"', "there is no file"),
+                            ('scene = "', "scen = \"", 'scene = "..." is missing'),
+                            ("[[target]]", "[target]", r"at least one \[\[target\]\]"),
+                            ("iterations", "iterations =", "not valid TOML")):  # fmt: skip
+        with pytest.raises(OptionError, match=words):
+            config.read(write_config(tmp_path, **{old: new}))
+    with pytest.raises(OptionError, match="does not exist"):
+        config.read(tmp_path / "missing.toml")
+
+
+def test_properties_that_the_integrator_does_not_have(llvm, tmp_path):
+    with pytest.raises(OptionError, match="max_dept"):
+        config.problem_of(config.read(write_config(tmp_path, max_depth="max_dept")))
+
+
+def test_targets(llvm, tmp_path):
+    scene = scene_of()
+    good = target_of(scene)
+    nan = good.copy()
+    nan[3, 4] = np.nan
+    for target, words in (
+        (good[:, :8], r"\(16, 8, 3\), but the sensor renders \(16, 16, 3\)"),
+        (good[..., :1], "pixel format"),
+        (nan, "3 of 768 values that are not finite"),
+        ([], "no target"),
+        (7, "must be an image"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            psdr_jit.optimize(scene, box_and_lamp(), target)
+    with pytest.raises(OptionError, match="no sensor 3"):
+        psdr_jit.optimize(scene, box_and_lamp(), {3: good})
+    with pytest.raises(OptionError, match="does not exist"):
+        psdr_jit.optimize(scene, box_and_lamp(), "nowhere.exr")
+    (tmp_path / "broken.exr").write_bytes(b"no image")
+    with pytest.raises(OptionError, match="cannot be read"):
+        psdr_jit.optimize(scene, box_and_lamp(), tmp_path / "broken.exr")
+
+
+def test_target_files_are_read_as_linear_radiance(llvm, tmp_path):
+    from psdr_jit.inverse.targets import read_image
+
+    image = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
+    images.write_exr(tmp_path / "target.exr", {"image": image})
+    assert np.allclose(np.array(read_image(tmp_path / "target.exr"))[..., :3], image)
+
+
+def test_variables(llvm):
+    for variables, error, words in (
+        ([], OptionError, "no variable"),
+        ([Pose(BOX, 0.1), Pose(BOX, 0.1)], OptionError, "several variables"),
+        ([Pose("bloker.vertex_positions", 0.1)], ParameterError, "did you mean 'blocker.vertex_positions'"),
+        ([Pose("lamp.intensity.value", 0.1)], ParameterError, "is no pose"),
+        ([Pose(BOX, 0.1, shift_axes="")], OptionError, "neither shift nor turn"),
+        ([Pose(BOX, 0.1, turn_axes="q")], OptionError, "letters out of xyz"),
+        ([Pose(BOX, 0.1, turn_axes="y")], OptionError, "turn_rate"),
+        ([Pose(BOX, 0.0)], OptionError, "must be above 0"),
+        ([Parameter("camera.near_clip", 0.1)], ParameterError, "cannot be differentiated"),
+    ):
+        with pytest.raises(error, match=words):
+            psdr_jit.optimize(scene_of(), variables, np.zeros((16, 16, 3)))
+    with pytest.raises(OptionError, match="'iteration'; there are"):
+        psdr_jit.optimize(scene_of(), box_and_lamp(), np.zeros((16, 16, 3)), iteration=3)
+
+
+def test_a_loss_of_many_numbers(llvm):
+    problem = problem_of(loss=lambda image, target: image - target)
+    with pytest.raises(ParameterError, match="768 numbers: expected one"):
+        problem.apply(problem.start())
+        problem.evaluate(0)
+
+
+def test_exit_status_of_the_command(llvm, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main.main(["optimize", "missing.toml"]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    path = write_config(tmp_path, 2)
+    assert main.main(["optimize", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "finished after 2 iterations" in said and "distance from the scene file" in said
+    assert (tmp_path / "out" / "config" / "result.png").is_file()
