@@ -2,7 +2,7 @@
 
 A row tells how far the variables are from the truth at the start and at the end, beside what counts as solved. The peer
 runs the same loop with the same settings for the time that ours took; its learning rates decay over as many iterations
-as fit into it.
+as fit into it. Cases `overhead: …` take the time of an iteration apart, at 256 x 256 pixels and 16 samples per pixel.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from benchmarks import rows
 from benchmarks.distances import chamfer
+from benchmarks.inverse_tables import OURS, OVERHEAD, PEER
 from benchmarks.suites import Settings
 from psdr_jit.errors import PsdrError
 from psdr_jit.inverse import config, loop
@@ -28,10 +30,10 @@ from psdr_jit.inverse import config, loop
 NAME = "inverse"
 BUDGET = 600.0  # [s] longest run
 FOLDER = rows.ROOT / "scenes" / "inverse"
-OURS, PEER = "psdr_path", "prb_projective"
 STARTS = {"": None, ", start 1": 1, ", start 2": 2}
 TRIAL = 3  # iterations of the peer that tell its speed, the first not counted
 FEWEST = 3  # iterations that the peer gets at least
+OVERHEAD_RES, OVERHEAD_SPP, OVERHEAD_WARM_UP, OVERHEAD_ITERATIONS = 256, 16, 3, 12
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Opened:
 
 
 def case_names() -> list[str]:
-    return [name + start for name in EXAMPLES for start in STARTS]
+    return [*(name + start for name in EXAMPLES for start in STARTS), *(OVERHEAD + name for name in EXAMPLES)]
 
 
 def quick_case_names() -> list[str]:
@@ -114,10 +116,16 @@ def quick_case_names() -> list[str]:
 
 
 def method_names(case: str) -> list[str]:
-    return [OURS, PEER]
+    return [OURS] if case.startswith(OVERHEAD) else [OURS, PEER]
 
 
 def open_case(name: str, settings: Settings) -> Opened:
+    if name.startswith(OVERHEAD):
+        example = EXAMPLES[name.removeprefix(OVERHEAD)]
+        found = config.read(FOLDER / f"{example.file}.toml", spp=OVERHEAD_SPP, snapshot_every=0)
+        targets = tuple({**target, "render": 1} for target in found.targets)
+        return Opened(name, example, replace(found, targets=targets, defaults={**found.defaults, "res": OVERHEAD_RES}),
+                      settings)  # fmt: skip
     example, _, start = name.partition(",")
     perturb = STARTS["," + start if start else ""]
     found = config.read(FOLDER / f"{EXAMPLES[example].file}.toml", max_seconds=settings.budget)
@@ -128,6 +136,8 @@ def open_case(name: str, settings: Settings) -> Opened:
 def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     """The row of one run, without circumstances."""
     row = {"bench": NAME, "case": opened.name, "method": method_name, "family": opened.example.file}
+    if opened.name.startswith(OVERHEAD):
+        return {**row, **iteration_times(opened)}
     try:
         chosen = opened.config if method_name == OURS else peer_of(opened)
         found, folder = run(opened, chosen)
@@ -174,6 +184,32 @@ def run(opened: Opened, chosen: config.Config) -> tuple[dict[str, Any], Path]:
         "loss": result.loss, "before": before, "after": after, "limits": limits,
         "solved": all(after[name] < limit for name, limit in limits.items()),
     }, folder  # fmt: skip
+
+
+def iteration_times(opened: Opened) -> dict[str, Any]:
+    """Milliseconds of an iteration, of its kernels, and what is left: Python, tracing, launching."""
+    problem = config.problem_of(opened.config)
+    stepper = loop.Stepper(problem)
+    wall, kernels, launches = [], [], []
+    for k in range(OVERHEAD_WARM_UP + OVERHEAD_ITERATIONS):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            start = time.perf_counter()
+            stepper.step()
+            dr.sync_thread()
+            seconds = time.perf_counter() - start
+            history = dr.kernel_history()
+        if k >= OVERHEAD_WARM_UP:
+            wall.append(1e3 * seconds)
+            kernels.append(sum(entry["execution_time"] for entry in history))
+            launches.append(len(history))
+    outside = np.array(wall) - np.array(kernels)
+    return {
+        "settings": {"res": OVERHEAD_RES, "spp": OVERHEAD_SPP, "views": len(problem.chosen(0))}, "status": "ok",
+        "seeds": OVERHEAD_ITERATIONS, "wall_ms": rows.summary(wall), "kernel_ms": rows.summary(kernels),
+        "outside_kernels_ms": rows.summary(outside), "outside_share": rows.summary(outside / wall),
+        "launches": float(np.median(launches)),
+    }  # fmt: skip
 
 
 def keep_pictures(opened: Opened, folder: Path) -> None:

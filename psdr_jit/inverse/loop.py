@@ -108,6 +108,26 @@ def run(
     return result
 
 
+class Stepper:
+    """The loop taken apart: one iteration at a time, without files. For measurements and loops of one's own."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._state = _begin(problem)
+        self._journal = Journal(None, problem, keep=0)
+
+    def step(self) -> float:
+        """One iteration; the loss before its step."""
+        loss = _iterate(self.problem, self._state, self._journal)
+        self._state.iteration += 1
+        return loss
+
+    @property
+    def latents(self) -> Latents:
+        """As they are now, detached."""
+        return _detached(self._state.latents)
+
+
 def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float], progress: Any) -> str:
     """Iterate until there is a reason to stop, and return it."""
     total, limit = problem.settings.iterations, problem.settings.max_seconds

@@ -112,6 +112,8 @@ class Pose:
 
     Latents, both 0 at the scene's own pose: `shift` [scene units] and `turn`, a rotation vector [rad]. Shapes move in
     world space about the centre of their bounding box, sensors and lights in their own frame about their own origin.
+    With a `pivot` (x, y, z), all of them turn about that point in world space: a camera whose pivot is in the middle of
+    what it sees converges faster, because turning then does not look like shifting.
     `shift_axes`, `turn_axes`: axes along and about which it may move, such as "xz", "y" or "".
     `start_shift`, `start_turn` [degrees]: where it starts. `spread_shift`, `spread_turn` [degrees]: half-widths of the
     random displacement of a perturbed start. A step moves by at most about `learning_rate` and `turn_rate` [degrees].
@@ -126,6 +128,7 @@ class Pose:
     start_turn: Sequence[float] = (0.0, 0.0, 0.0)
     spread_shift: float = 0.0
     spread_turn: float = 0.0
+    pivot: Sequence[float] | None = None
     uniform: bool = False
     _base: Any = field(default=None, init=False, repr=False)
     _pivot: Any = field(default=None, init=False, repr=False)
@@ -157,6 +160,8 @@ class Pose:
         self._base = copy_of(params[self.parameter])
         node = params.properties[self.parameter][2]
         self._pivot = mi.Point3f(list(node.bbox().center())) if isinstance(node, mi.Shape) else None
+        if self.pivot is not None:
+            self._pivot = mi.Point3f(*broadcast(self.pivot, (3,), f"the pivot of '{self.parameter}'").tolist())
         dr.make_opaque(self._pivot)
         return {name: dr.opaque(mi.Vector3f, 0) for name in self.learning_rates}
 
@@ -200,13 +205,15 @@ class Pose:
         return latents
 
     def offset(self, latents: Mapping[str, Any]) -> dict[str, float]:
-        found = {}
-        for name in latents:
-            length = float(np.linalg.norm(numbers(self._allowed(latents, name))))
-            found["distance" if name == "shift" else "angle_degrees"] = (
-                length if name == "shift" else float(np.rad2deg(length))
-            )
-        return found
+        """Distance [scene units] of the body's centre, or of a sensor's or light's origin, and angle [degrees]."""
+        shift, turn = (numbers(self._allowed(latents, name)) for name in ("shift", "turn"))
+        if is_transform(self._base):
+            with dr.suspend_grad():
+                origins = [numbers(pose @ mi.Point3f(0)) for pose in (self.value(latents), self._base)]
+            shift = origins[0] - origins[1]
+        found = {"distance": float(np.linalg.norm(shift)), "angle_degrees": float(np.rad2deg(np.linalg.norm(turn)))}
+        kept = {"distance"} if "turn" not in latents else {"angle_degrees"} if "shift" not in latents else set(found)
+        return {name: value for name, value in found.items() if name in kept}
 
 
 def rigid(shift: mi.Vector3f, turn: mi.Vector3f) -> mi.Transform4f:

@@ -16,7 +16,6 @@ import psdr_jit
 from psdr_jit import Parameter, Pose, integrators, scene_io
 from psdr_jit.errors import OptionError, ParameterError, StalledWarning
 from psdr_jit.inverse import loop
-from psdr_jit.inverse.journal import Journal
 from psdr_jit.inverse.losses import Loss
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.settings import Settings
@@ -157,13 +156,12 @@ def test_no_kernel_is_compiled_after_the_first_iteration(llvm, name):
     else:
         variables = [Pose("camera.to_world", 0.01, turn_rate=0.2, turn_axes="xyz")] if name == "camera" else None
         problem = problem_of(variables, iterations=8)
-    state, journal = loop._begin(problem), Journal(None, problem, keep=0)
+    stepper = loop.Stepper(problem)
     known, new = set(), []
     for _ in range(8):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            loop._iterate(problem, state, journal)
-            state.iteration += 1
+            stepper.step()
             found = {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
         new.append(len(found - known))
         known |= found
@@ -173,11 +171,10 @@ def test_no_kernel_is_compiled_after_the_first_iteration(llvm, name):
 def test_memory_is_flat(llvm):
     """Over 1,000 iterations, in bytes that Dr.Jit holds and in variables that it knows."""
     problem = problem_of([Pose(BOX, 1e-4, shift_axes="x")], targets=np.zeros((16, 16, 3)), spp=1, iterations=1000)
-    state, journal = loop._begin(problem), Journal(None, problem, keep=0)
+    stepper = loop.Stepper(problem)
     held = []
     for k in range(1000):
-        loop._iterate(problem, state, journal)
-        state.iteration += 1
+        stepper.step()
         if k % 100 == 99:
             gc.collect()
             held.append(resident_mib())

@@ -1,0 +1,49 @@
+"""Tables of the suite `inverse`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.tables import markdown
+
+OURS, PEER = "psdr_path", "prb_projective"
+OVERHEAD = "overhead: "  # begins the names of cases that take the time of an iteration apart
+
+UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer": "Chamfer distance",
+         "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size"}  # fmt: skip
+
+
+def outcome_table(found: list[dict[str, Any]]) -> str:
+    """Every example and start: the error before, after, and by the peer in equal time."""
+    lines = []
+    for case in dict.fromkeys(r["case"] for r in found if not r["case"].startswith(OVERHEAD)):
+        of = {r["method"]: r for r in found if r["case"] == case}
+        ours, peer = of.get(OURS), of.get(PEER)
+        if ours is None or ours["status"] != "ok":
+            lines.append([case, "", "", f"cannot: {ours['error']}" if ours else "", "", "", ""])
+            continue
+        for k, name in enumerate(ours["limits"]):
+            after = f"{ours['after'][name]:.3g}"
+            there = peer is not None and peer["status"] == "ok"
+            theirs = f"{peer['after'][name]:.3g}" if there else "cannot"
+            lines.append([
+                case if k == 0 else "", UNITS[name], f"{ours['before'][name]:.3g}", f"{ours['limits'][name]:.3g}",
+                after if ours["after"][name] < ours["limits"][name] else f"**{after}**",
+                f"{ours['seconds']:.0f} s, {ours['iterations']}" if k == 0 else "",
+                theirs, f"{peer['seconds']:.0f} s, {peer['iterations']}" if there and k == 0 else "",
+            ])  # fmt: skip
+    head = ("example", "error", "start", "solved below", OURS, "time, iterations", PEER, "time, iterations")
+    return markdown(head, lines)
+
+
+def overhead_table(found: list[dict[str, Any]]) -> str:
+    """What an iteration consists of."""
+    lines = []
+    for r in (r for r in found if r["case"].startswith(OVERHEAD) and r["status"] == "ok"):
+        lines.append([
+            r["case"].removeprefix(OVERHEAD), str(r["settings"]["views"]), f"{r['wall_ms']['median']:.0f}",
+            f"{r['kernel_ms']['median']:.0f}", f"{r['outside_kernels_ms']['median']:.0f}",
+            f"{100 * r['outside_share']['median']:.0f} %",
+        ])  # fmt: skip
+    head = ("example", "views", "iteration [ms]", "kernels [ms]", "Python and tracing [ms]", "share")
+    return markdown(head, lines)
