@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import planning_tables, rows, tables
+from benchmarks import inverse_tables, planning_tables, rows, tables
 from psdr_jit.support import support_table
 
 README = rows.ROOT / "README.md"
@@ -34,6 +34,12 @@ PLANS = (
     "term). The derivatives agree within their noise: z-scores of 8 x 8 pixel blocks. Then material gradients beside "
     "Mitsuba's `prb`."
 )
+OPTIMISATIONS = (
+    "The optimisations of `scenes/inverse`, from their own start and from two random ones; bold: not solved. "
+    "`prb_projective` (no guiding) runs the same loop for the same time, with learning rates that decay over as many "
+    "iterations as fit into it."
+)
+ITERATIONS = "What an iteration consists of, at 256 x 256 pixels and 16 samples per pixel (medians):"
 WHAT_IS_WHAT = (
     "Made by `psdr bench --report`. Errors are relative to the root mean square of the reference derivative image. The "
     "gain is the least-squares slope against the reference (finite differences in the sweeps). Bias: root mean square "
@@ -47,7 +53,7 @@ def benchmark_tables(found: list[dict[str, Any]]) -> str:
     of = grouped(found)
     measured = of.get("accuracy", [])
     lines = tables.summary(measured)
-    planned = of.get("planning", [])
+    planned, inverse = of.get("planning", []), of.get("inverse", [])
     parts = [
         (lines, lambda: tables.summary_words(lines)),
         (lines, lambda: tables.summary_table(lines)),
@@ -56,6 +62,9 @@ def benchmark_tables(found: list[dict[str, Any]]) -> str:
         (planned, lambda: planning_tables.prb_table(planned)),
         (planned, lambda: planning_tables.forms_words(planned)),
         (planned, lambda: pictures("forms.png")),
+        (inverse, lambda: OPTIMISATIONS + "\n\n" + inverse_tables.outcome_table(inverse)),
+        (inverse, lambda: optimised_pictures()),
+        (inverse, lambda: ITERATIONS + "\n\n" + inverse_tables.overhead_table(inverse)),
         (of.get("stability"), lambda: SWEEPS + "\n\n" + tables.stability_table(of["stability"])),
         (of.get("stability"), lambda: pictures("stability.png")),
         (of.get("cost"), lambda: pictures("cost.png")),
@@ -94,6 +103,15 @@ def pictures(*names: str) -> str:
     """Links to the charts that exist."""
     there = [name for name in names if (rows.RESULTS / "charts" / name).is_file()]
     return "\n\n".join(f"![{CHARTS[name]}](benchmarks/results/charts/{name})" for name in there)
+
+
+def optimised_pictures() -> str:
+    """Links to the strips of images before and after."""
+    links = []
+    for path in sorted((rows.RESULTS / "inverse").glob("*_result.png")):
+        words = f"{path.stem.removesuffix('_result')}: initial, final, target, error"
+        links.append(f"![{words}](benchmarks/results/inverse/{path.name})")
+    return "\n\n".join(links)
 
 
 def stored_rows(folder: Path) -> list[dict[str, Any]]:

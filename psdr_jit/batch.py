@@ -35,9 +35,11 @@ def splits(sensor: mi.Sensor) -> bool:
 
 
 def parts_of(sensor: mi.Sensor, seed: Any, spp: int) -> list[Part]:
-    """The sensors of a batch from left to right, with seeds of their own. `spp` 0: what the batch's sampler says."""
-    spp = spp or sensor.sampler().sample_count()
-    return [Part(child, _seed(seed, k), spp) for k, child in enumerate(_sensors(sensor))]
+    """The sensors of a batch from left to right, each with a seed of its own and the batch's sample count."""
+    found = _sensors(sensor)
+    for child in found:
+        child.sampler().set_sample_count(sensor.sampler().sample_count())
+    return [Part(child, _seed(seed, k), spp) for k, child in enumerate(found)]
 
 
 def _sensors(batch: mi.Sensor) -> list[mi.Sensor]:

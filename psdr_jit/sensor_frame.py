@@ -126,15 +126,18 @@ def lens_point(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Point3f:
 
 
 def origin_box(frame: SensorFrame) -> tuple[list[float], list[float]]:
-    """Bounding box `(lower, upper)` of the points in which camera rays start, world space."""
+    """Bounding box `(lower, upper)` of lens and near plane, between which camera rays start, world space."""
     if frame.kind == "orthographic":
         x0, y0 = float(frame.corner.x[0]), float(frame.corner.y[0])
         x1, y1 = x0 + float(frame.extent.x[0]), y0 + float(frame.extent.y[0])
         near = float(frame.near[0])
         local = [(x, y, near) for x in (x0, x1) for y in (y0, y1)]
     else:
-        r = float(frame.aperture[0])
+        r, near = float(frame.aperture[0]), float(frame.near[0])
+        (x0, y0), (w, h) = ((float(v.x[0]), float(v.y[0])) for v in (frame.corner, frame.extent))
         local = [(x, y, 0.0) for x in (-r, r) for y in (-r, r)]
+        local += [(near * x + a, near * y + b, near) for x in (x0, x0 + w) for y in (y0, y0 + h)
+                  for a in (-r, r) for b in (-r, r)]  # fmt: skip
     points = frame.to_world @ mi.Point3f(*(mi.Float(column) for column in zip(*local, strict=True)))
     return [float(dr.min(c)[0]) for c in points], [float(dr.max(c)[0]) for c in points]
 

@@ -36,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check, optimise, report."""
     from psdr_jit import scene_io
-    from psdr_jit.errors import OptionError
     from psdr_jit.inverse import config as configs
     from psdr_jit.inverse import loop
 
@@ -47,10 +46,7 @@ def run(args: argparse.Namespace) -> int:
     if args.integrator:
         config = configs.with_integrator(config, args.integrator)
     out = args.out or Path("out") / Path(args.config).stem
-    if not args.resume and (out / "checkpoint.npz").exists():
-        raise OptionError(
-            f"'{out}' holds an earlier run: go on with it by --resume, or choose another folder with --out"
-        )
+    loop.require_folder(out, args.resume)  # before targets are rendered
     problem = configs.problem_of(config)
     start = time.perf_counter()
     with _common.progress_bar("optimize", args.quiet) as report:

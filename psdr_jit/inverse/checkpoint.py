@@ -30,8 +30,8 @@ class Checkpoint:
     iteration: int
     fingerprint: str  # of the problem; a run continues only the same one
     arrays: Mapping[str, np.ndarray]
-    best: Mapping[str, np.ndarray]
-    best_loss: float
+    best: Mapping[str, np.ndarray]  # latents of the best state
+    history: Mapping[str, np.ndarray]  # losses, see `History.arrays`, and means of the targets
     seconds: float
 
 
@@ -42,19 +42,21 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".checkpoint-", suffix=".npz")
         with os.fdopen(handle, "wb") as file:
             header = {"format": FORMAT, "iteration": checkpoint.iteration, "fingerprint": checkpoint.fingerprint,
-                      "best_loss": checkpoint.best_loss, "seconds": checkpoint.seconds}  # fmt: skip
-            np.savez(file, header=json.dumps(header), **{f"now/{k}": v for k, v in checkpoint.arrays.items()},
-                     **{f"best/{k}": v for k, v in checkpoint.best.items()})  # fmt: skip
+                      "seconds": checkpoint.seconds}  # fmt: skip
+            parts = {"now": checkpoint.arrays, "best": checkpoint.best, "history": checkpoint.history}
+            named = {f"{part}/{key}": value for part, found in parts.items() for key, value in found.items()}
+            np.savez(file, header=json.dumps(header), **named)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
         raise CheckpointError(
             f"the checkpoint '{path}' could not be written ({error.strerror or error}); the one before "
             "is intact; make room or choose another folder"
         ) from error
+    finally:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
 
 
 def load(path: Path, fingerprint: str) -> Checkpoint:
@@ -65,19 +67,23 @@ def load(path: Path, fingerprint: str) -> Checkpoint:
         with np.load(path) as file:
             header = json.loads(str(file["header"]))
             arrays = {key: file[key] for key in file.files if key != "header"}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"'{path}' is no checkpoint ({error}); remove it and start anew") from error
     if header.get("format") != FORMAT:
         raise CheckpointError(f"'{path}' was written by another version; remove it and start anew")
     if header["fingerprint"] != fingerprint:
         raise CheckpointError(
-            f"'{path}' belongs to another problem: scene, variables, targets or settings differ from "
-            "those it was started with; use another output folder, or remove it"
+            f"'{path}' belongs to another problem: scene, variables, loss, integrator or settings differ from those it "
+            "was started with; use another output folder, or remove it"
         )
     return Checkpoint(
-        header["iteration"], fingerprint, _below("now/", arrays), _below("best/", arrays), header["best_loss"],
+        header["iteration"],
+        fingerprint,
+        _below("now/", arrays),
+        _below("best/", arrays),
+        _below("history/", arrays),
         header["seconds"],
-    )  # fmt: skip
+    )
 
 
 def _below(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

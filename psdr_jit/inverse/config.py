@@ -42,6 +42,7 @@ from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.shapes import Profile, Vertices
 from psdr_jit.inverse.targets import rendered
 from psdr_jit.inverse.variables import Parameter, Pose
+from psdr_jit.options import Options
 
 KINDS = {"parameter": Parameter, "pose": Pose, "vertices": Vertices, "profile": Profile}
 TABLES = ("scene", "loss", "defaults", "integrator", "target", "variable")
@@ -88,9 +89,7 @@ def read(path: str | Path, **changes: Any) -> Config:
 def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config | None:
     setting_names = [f.name for f in fields(Settings)]
     _unknown("", content, [*TABLES, *setting_names], wrong)
-    for name in ("defaults", "integrator", "optimizer"):
-        if not isinstance(content.get(name, {}), Mapping):
-            wrong.append(f"{name} must be a table: [{name}]")
+    tables = {name: _table(content, name, wrong) for name in ("defaults", "integrator")}
     for name in ("target", "variable"):
         if not isinstance(content.get(name), list) or not all(isinstance(x, Mapping) for x in content[name]):
             wrong.append(f"there must be at least one [[{name}]]")
@@ -98,21 +97,29 @@ def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config
     if "scene" not in content:
         wrong.append('scene = "..." is missing')
     elif not scene.is_file():
-        wrong.append(f"scene = \"{content['scene']}\": there is no file '{scene}'")
+        wrong.append(f"scene = {content['scene']!r}: there is no file '{scene}'")
     loss = content.get("loss", "l2")
-    if loss not in LOSSES:
+    if not isinstance(loss, str) or loss not in LOSSES:
         wrong.append(f"loss = {loss!r}: expected one of {', '.join(LOSSES)}")
     targets = [_target(path, k, t, wrong) for k, t in enumerate(_tables(content, "target"))]
     variables = [_variable(k, v, wrong) for k, v in enumerate(_tables(content, "variable"))]
+    integrator = {"type": integrators.DEFAULT_INTEGRATOR, **tables["integrator"]}
+    if integrator["type"] == integrators.DEFAULT_INTEGRATOR:
+        _unknown("[integrator]: ", integrator, ["type", *(f.name for f in fields(Options))], wrong)
     try:
         settings = Settings(**{name: content[name] for name in setting_names if name in content})
     except OptionError as error:
         wrong += str(error).split("; ")
         return None
-    integrator = {"type": integrators.DEFAULT_INTEGRATOR, **content.get("integrator", {})}
-    return Config(
-        path, scene, loss, content.get("defaults", {}), integrator, tuple(targets), tuple(variables), settings
-    )
+    return Config(path, scene, loss, tables["defaults"], integrator, tuple(targets), tuple(variables), settings)
+
+
+def _table(content: Mapping[str, Any], name: str, wrong: list[str]) -> Mapping[str, Any]:
+    found = content.get(name, {})
+    if isinstance(found, Mapping):
+        return found
+    wrong.append(f"{name} = {found!r}: expected a table, [{name}]")
+    return {}
 
 
 def _tables(content: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
@@ -148,6 +155,8 @@ def _with_paths(path: Path, table: Mapping[str, Any], where: str, k: int, wrong:
     """With a list of sensors and absolute paths of files, which must exist."""
     sensors = table.get("sensor", k)
     found = {**table, "sensor": sensors if isinstance(sensors, list) else [sensors]}
+    if not all(isinstance(x, int) and not isinstance(x, bool) for x in found["sensor"]):
+        wrong.append(f"{where}sensor = {sensors!r}: expected an index or a list of them")
     if "file" in table and len(found["sensor"]) != 1:
         wrong.append(f"{where}a file is the target of one sensor")
     for key in ("file", "scene"):
@@ -160,7 +169,7 @@ def _with_paths(path: Path, table: Mapping[str, Any], where: str, k: int, wrong:
 
 def _variable(k: int, table: Mapping[str, Any], wrong: list[str]) -> Any:
     where = f"[[variable]] {k + 1}: "
-    kind = KINDS.get(table.get("kind"))
+    kind = KINDS.get(table["kind"]) if isinstance(table.get("kind"), str) else None
     if kind is None:
         wrong.append(f"{where}kind = {table.get('kind')!r}: expected one of {', '.join(KINDS)}")
         return None
@@ -169,19 +178,35 @@ def _variable(k: int, table: Mapping[str, Any], wrong: list[str]) -> Any:
     missing = [f.name for f in own if f.default is MISSING and f.default_factory is MISSING and f.name not in table]
     if missing:
         wrong.append(f"{where}{' and '.join(missing)} must be given")
-        return None
-    numeric = [f.name for f in own if f.type == "float"]
-    for name in numeric:
-        if name in table and (not isinstance(table[name], (int, float)) or isinstance(table[name], bool)):
-            wrong.append(f"{where}{name} = {table[name]!r}: expected a number")
-    return kind(**{f.name: table[f.name] for f in own if f.name in table})
+    bad = [f for f in own if f.name in table and not ACCEPTED[f.type.removesuffix(" | None")][1](table[f.name])]
+    for f in bad:
+        wrong.append(f"{where}{f.name} = {table[f.name]!r}: expected {ACCEPTED[f.type.removesuffix(' | None')][0]}")
+    return None if missing or bad else kind(**{f.name: table[f.name] for f in own if f.name in table})
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_number, value))
+
+
+ACCEPTED = {  # annotation of a variable's field: what to call its values, and which are such
+    "float": ("a number", _is_number),
+    "str": ("a text", lambda value: isinstance(value, str)),
+    "bool": ("true or false", lambda value: isinstance(value, bool)),
+    "Sequence[float]": ("a list of three numbers", lambda value: _is_list(value) and len(value) == 3),
+    "Any": ("a number or a list of numbers", lambda value: _is_number(value) or _is_list(value)),
+}
 
 
 def problem_of(config: Config) -> Problem:
     """Load the scene, render or read the targets. Raises what loading and checking raise."""
     scene = scene_io.load_scene(config.scene, **config.defaults)
     integrator = integrators.build(integrators.integrator_spec(scene, config.integrator))
-    path = integrators.reference(integrators.integrator_spec(scene, config.integrator))
+    kept = {key: value for key, value in config.integrator.items() if key in integrators.PATH_OPTIONS}
+    path = integrators.build(integrators.integrator_spec(scene, kept | {"type": integrators.DEFAULT_INTEGRATOR}))
     targets: dict[int, Any] = {}
     for target in config.targets:
         source = scene

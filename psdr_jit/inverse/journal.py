@@ -8,6 +8,7 @@ A full disk does not end a run: what could not be written is warned about, once 
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from psdr_jit.errors import CheckpointError, OptionError
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
 from psdr_jit.inverse.variables import numbers
+from psdr_jit.params import is_transform
 
 #: Views that the final strip shows, and samples per pixel of its images.
 SHOWN, STRIP_SPP = 3, 64
@@ -38,19 +40,26 @@ class Journal:
         self.not_written: list[str] = []
         self._rows: list[dict[str, Any]] = []
         self._initial: list[np.ndarray] = []
+        self._log: Any = None
         if folder is None:
             return
         try:
             (folder / "snapshots").mkdir(parents=True, exist_ok=True)
-            self._rows = [row for row in _rows(folder / "log.jsonl") if row["iteration"] < keep]
             images.check_writable(folder / "log.jsonl")
-            self._log = open(folder / "log.jsonl", "w", encoding="utf-8")  # noqa: SIM115, open as long as the run
-            self._log.writelines(json.dumps(row) + "\n" for row in self._rows)
-            self._log.flush()
+            self._rows = [row for row in _rows(folder / "log.jsonl") if row["iteration"] < keep]
+            kept = folder / ".log.jsonl"  # renamed once it is complete: a full disk must not cost the history
+            kept.write_text("".join(json.dumps(row) + "\n" for row in self._rows), encoding="utf-8")
+            os.replace(kept, folder / "log.jsonl")
+            self._log = open(folder / "log.jsonl", "a", encoding="utf-8")  # open as long as the run
         except OSError as error:
             raise OptionError(
                 f"cannot write to the folder '{folder}': {error.strerror or error}; choose another"
             ) from error
+
+    def close(self) -> None:
+        """Close the log."""
+        if self._log is not None:
+            self._try("log.jsonl", self._log.close)
 
     def step(self, iteration: int, loss: float, norms: dict[str, float], seconds: float, views: list[int], rate: float,
              offsets: dict[str, dict[str, float]]) -> None:  # fmt: skip
@@ -58,7 +67,7 @@ class Journal:
         row = {
             "iteration": iteration,
             "loss": loss if np.isfinite(loss) else None,
-            "gradient_norm": norms,
+            "gradient_norm": {name: norm if np.isfinite(norm) else None for name, norm in norms.items()},
             "seconds": seconds,
             "views": views,
             "rate": rate,
@@ -107,14 +116,13 @@ class Journal:
         self._try(
             "result.json", lambda: (self.folder / "result.json").write_text(json.dumps(_summary(result), indent=1))
         )
-        self._log.close()
 
     def _try(self, what: str, write: Callable[[], Any]) -> None:
         if self.folder is None:
             return
         try:
             write()
-        except (OSError, OptionError, CheckpointError) as error:
+        except (OSError, RuntimeError, OptionError, CheckpointError) as error:  # RuntimeError: OpenEXR and Mitsuba
             if what not in self.not_written:
                 self.not_written.append(what)
                 said = f"'{self.folder / what}' was not written: {error}; the optimisation goes on"
@@ -143,15 +151,24 @@ def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray]) -> 
 
 
 def _write_values(folder: Path, problem: Any) -> None:
-    values = {name: numbers(problem.params[name].matrix if hasattr(problem.params[name], "matrix") else
-                            problem.params[name]) for name in problem.variables}  # fmt: skip
-    np.savez(folder / "final.npz", **values)
+    """Values by parameter: poses as (4, 4), vertices as (V, 3), everything else in its own shape."""
+    np.savez(folder / "final.npz", **{name: _value(name, problem.params[name]) for name in problem.variables})
     for name in problem.variables:
         node = problem.params.properties[name][2]
         if name.endswith(VERTEX_POSITIONS) and isinstance(node, mi.Mesh):
             node.write_ply(str(folder / f"{node.id()}.ply"))
 
 
+def _value(name: str, value: Any) -> np.ndarray:
+    if is_transform(value):
+        return np.array(dr.detach(value.matrix)).reshape(4, 4)
+    if dr.is_tensor_v(value):
+        return np.array(dr.detach(value))
+    flat = numbers(value)
+    return flat.reshape(-1, 3) if name.endswith(VERTEX_POSITIONS) else flat
+
+
 def _summary(result: Any) -> dict[str, Any]:
-    return {"status": result.status, "iterations": result.iterations, "seconds": result.seconds, "loss": result.loss,
+    loss = result.loss if np.isfinite(result.loss) else None
+    return {"status": result.status, "iterations": result.iterations, "seconds": result.seconds, "loss": loss,
             "offset": result.offsets, "start_offset": result.start_offsets}  # fmt: skip

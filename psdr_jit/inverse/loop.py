@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,17 +16,20 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from psdr_jit.errors import OptionError, StalledWarning, ZeroDerivativeWarning
+from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse.checkpoint import Checkpoint
+from psdr_jit.inverse.history import History
 from psdr_jit.inverse.journal import Journal
-from psdr_jit.inverse.problem import Latents, Problem
+from psdr_jit.inverse.problem import Latents, Problem, copied
 from psdr_jit.inverse.variables import like, numbers
 
-#: Losses that are averaged before a run counts as diverging, or a state as the best: one alone may be noise.
-RECENT = 5
-
 FINISHED, OUT_OF_TIME, DIVERGED, INTERRUPTED = "finished", "out of time", "diverged", "interrupted"
+
+CHECKPOINT = "checkpoint.npz"
+
+#: Relative difference of a target's mean up to which it is the same target: renders differ by rounding.
+SAME_TARGET = 1e-2
 
 
 @dataclass
@@ -37,15 +40,11 @@ class Result:
     iterations: int  # that have been done, in all runs together
     seconds: float  # of all runs together, without reading and checking the problem
     losses: list[float]  # by iteration of this run, before its step
+    loss: float  # mean of the last few; NaN without any
     latents: Latents  # detached
     offsets: dict[str, dict[str, float]]  # from the scene's own values, now ...
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
     not_written: list[str] = field(default_factory=list)  # what the disk did not take
-
-    @property
-    def loss(self) -> float:
-        """Mean of the last few losses."""
-        return float(np.mean(self.losses[-RECENT:])) if self.losses else float("nan")
 
 
 @dataclass
@@ -54,15 +53,11 @@ class _State:
 
     latents: Latents
     optimisers: dict[str, Any]  # by parameter
-    best: Latents
-    best_loss: float = float("inf")
+    history: History
     iteration: int = 0
     seconds: float = 0.0  # of runs before this one
-    first_losses: list[float] = field(default_factory=list)
-    recent: deque = field(default_factory=lambda: deque(maxlen=RECENT))  # losses
-    passed: deque = field(default_factory=lambda: deque(maxlen=RECENT))  # (loss, latents) of the same iterations
-    without_gradient: dict[str, int] = field(default_factory=dict)
-    norms: dict[str, float] = field(default_factory=dict)  # of the latest gradient
+    lost: dict[str, int] = field(default_factory=dict)  # iterations in a row without a usable gradient, by latent
+    norms: dict[str, float] = field(default_factory=dict)  # of the latest gradient, by latent
     began: float = field(default_factory=time.perf_counter)
 
     def clock(self) -> float:
@@ -77,35 +72,43 @@ def run(
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Result:
     """Optimise; with a `folder`, log there, checkpoint, and `resume` from it. See `psdr_jit.optimize`."""
+    require_folder(folder, resume)
     state = _begin(problem)
-    start_offsets = problem.offsets(problem.start())
+    if resume:
+        _restore(problem, state, checkpoints.load(folder / CHECKPOINT, problem.fingerprint))
+    journal = Journal(folder, problem, keep=state.iteration)
+    losses: list[float] = []
+    try:
+        journal.picture(problem, problem.start())
+        with warnings.catch_warnings():
+            # said once it has lasted, with the variable's name; entered once, or "once" would mean every iteration
+            warnings.simplefilter("ignore", ZeroDerivativeWarning)
+            status = _loop(problem, state, journal, losses, progress)
+        if status != DIVERGED:
+            journal.keep(_checkpoint(problem, state))
+        found = copied(state.history.best if status == DIVERGED else state.latents)
+        problem.apply(found)
+        start = problem.offsets(problem.start())
+        result = Result(
+            status, state.iteration, state.clock(), losses, state.history.mean, found, problem.offsets(found), start
+        )
+        if status != INTERRUPTED:
+            journal.finish(problem, result)
+        result.not_written = journal.not_written
+    finally:
+        journal.close()
+    return result
+
+
+def require_folder(folder: Path | None, resume: bool) -> None:
+    """Raise `OptionError` if there is nothing to resume from, or an earlier run that would be overwritten."""
     if resume and folder is None:
         raise OptionError("resuming needs the folder of the run that was interrupted")
-    if resume:
-        _restore(problem, state, checkpoints.load(folder / "checkpoint.npz", problem.fingerprint()))
-    journal = Journal(folder, problem, keep=state.iteration)
-    journal.picture(problem, problem.start())
-    losses: list[float] = []
-    status = _loop(problem, state, journal, losses, progress)
-    if status == DIVERGED:
-        state.latents = state.best
-    else:
-        journal.keep(_checkpoint(problem, state))
-    found = _detached(state.latents)
-    problem.apply(found)
-    result = Result(
-        status,
-        state.iteration,
-        state.clock(),
-        losses,
-        found,
-        problem.offsets(found),
-        start_offsets,
-        journal.not_written,
-    )
-    if status != INTERRUPTED:
-        journal.finish(problem, result)
-    return result
+    if not resume and folder is not None and (folder / CHECKPOINT).exists():
+        raise OptionError(
+            f"'{folder}' holds an earlier run: go on with it by resuming (--resume), choose another folder (--out), or "
+            "remove it"
+        )
 
 
 class Stepper:
@@ -125,32 +128,51 @@ class Stepper:
     @property
     def latents(self) -> Latents:
         """As they are now, detached."""
-        return _detached(self._state.latents)
+        return copied(self._state.latents)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Values and moments of all optimisers."""
+        return checkpoints.optimiser_arrays(self._state.optimisers)
 
 
 def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float], progress: Any) -> str:
     """Iterate until there is a reason to stop, and return it."""
-    total, limit = problem.settings.iterations, problem.settings.max_seconds
+    settings, history = problem.settings, state.history
     with _interruptible() as interrupted:
-        while state.iteration < total:
+        while state.iteration < settings.iterations:
             if interrupted:
                 return INTERRUPTED
-            if limit is not None and state.clock() > limit:
+            if settings.max_seconds is not None and state.clock() > settings.max_seconds:
                 return OUT_OF_TIME
             losses.append(_iterate(problem, state, journal))
-            if _diverges(problem, state, losses[-1]):
-                warnings.warn(_about_divergence(state, losses[-1]), RuntimeWarning, stacklevel=4)
+            if history.diverges(settings.diverged_factor):
+                _say_diverged(state, f"the loss diverged (now {losses[-1]:.3e}, at first {history.scale:.3e})")
+                return DIVERGED
+            broken = [name for name, norm in state.norms.items() if not math.isfinite(norm)]
+            if any(state.lost[name] >= settings.stalled_after for name in broken):
+                _say_diverged(state, f"the gradient of {', '.join(broken)} has not been finite for "
+                                     f"{settings.stalled_after} iterations")  # fmt: skip
                 return DIVERGED
             state.iteration += 1
-            if state.iteration % problem.settings.checkpoint_every == 0:
+            if state.iteration % settings.checkpoint_every == 0:
                 journal.keep(_checkpoint(problem, state))
             if progress is not None:
-                each = (time.perf_counter() - state.began) / len(losses)
-                left = each * (total - state.iteration)
-                norm = " ".join(f"{value:.1e}" for value in state.norms.values())
-                note = f"loss {losses[-1]:.3e}  |gradient| {norm}  {each:.2f} s/it  {left:.0f} s left"
-                progress(state.iteration, total, note)
+                progress(state.iteration, settings.iterations, _note(problem, state, losses))
     return FINISHED
+
+
+def _note(problem: Problem, state: _State, losses: list[float]) -> str:
+    each = (time.perf_counter() - state.began) / len(losses)
+    left = each * (problem.settings.iterations - state.iteration)
+    norms = " ".join(f"{value:.1e}" for value in state.norms.values())
+    return f"loss {losses[-1]:.3e}  |gradient| {norms}  {each:.2f} s/it  {left:.0f} s left"
+
+
+def _say_diverged(state: _State, what: str) -> None:
+    best = state.history.best_loss
+    known = f"the best state (loss {best:.3e})" if math.isfinite(best) else "the start"
+    said = f"{what} at iteration {state.iteration}: stopped, {known} is kept; lower the learning rates, or raise spp"
+    warnings.warn(said, RuntimeWarning, stacklevel=5)
 
 
 @contextmanager
@@ -174,104 +196,89 @@ def _interruptible() -> Iterator[list[int]]:
 
 def _begin(problem: Problem) -> _State:
     latents = problem.start()
+    history = History(problem.period, problem.loss.images > 1, copied(latents))
     optimisers = {}
     for name, variable in problem.variables.items():
         opt = optimisers[name] = problem.settings.make_optimizer(variable.uniform)
         for latent, value in latents[name].items():
             opt[latent] = value
             latents[name][latent] = opt[latent]
-        checkpoints.make_opaque(opt)  # counters start as literals, which would compile other kernels in the first step
-    return _State(latents, optimisers, best=_detached(latents))
+        checkpoints.make_opaque(opt)  # counters start as literals: the first step would have kernels of its own
+    return _State(latents, optimisers, history)
 
 
 def _restore(problem: Problem, state: _State, stored: Checkpoint) -> None:
+    if not np.allclose(stored.history["targets"], problem.target_means, rtol=SAME_TARGET):
+        raise CheckpointError("the checkpoint belongs to other targets; use another output folder, or remove it")
     checkpoints.restore_optimisers(state.optimisers, stored.arrays)
+    best: Latents = {name: {} for name in state.latents}
     for name, latents in state.latents.items():
         for latent in latents:
             latents[latent] = state.optimisers[name][latent]
-            state.best[name][latent] = like(dr.detach(latents[latent]), stored.best[f"{name}/{latent}"])
-    state.iteration, state.seconds, state.best_loss = stored.iteration, stored.seconds, stored.best_loss
-    state.first_losses = stored.arrays["losses/first"].tolist()
-    state.recent.extend(stored.arrays["losses/recent"].tolist())
+            best[name][latent] = like(dr.detach(latents[latent]), stored.best[f"{name}/{latent}"])
+    state.iteration, state.seconds = stored.iteration, stored.seconds
+    state.history.restore(stored.history, best)
 
 
 def _checkpoint(problem: Problem, state: _State) -> Checkpoint:
+    best = {f"{name}/{latent}": numbers(v) for name, of in state.history.best.items() for latent, v in of.items()}
+    history = {**state.history.arrays(), "targets": problem.target_means}
     arrays = checkpoints.optimiser_arrays(state.optimisers)
-    arrays |= {"losses/first": np.array(state.first_losses), "losses/recent": np.array(list(state.recent))}
-    best = {f"{name}/{latent}": numbers(v) for name, found in state.best.items() for latent, v in found.items()}
-    return Checkpoint(state.iteration, problem.fingerprint(), arrays, best, state.best_loss,
-                      state.clock())  # fmt: skip
+    return Checkpoint(state.iteration, problem.fingerprint, arrays, best, history, state.clock())
 
 
 def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
     """One step of every optimiser; the loss before it."""
     start = time.perf_counter()
-    rate = problem.settings.decay ** (state.iteration / problem.settings.iterations)
-    before = _detached(state.latents)
+    before = copied(state.latents)
     problem.apply(state.latents)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ZeroDerivativeWarning)  # said once it has lasted, with the variable's name
-        loss, images = problem.evaluate(state.iteration)
-    state.recent.append(loss)
-    state.passed.append((loss, before))
-    if len(state.first_losses) < RECENT:
-        state.first_losses.append(loss)
-    if np.mean(state.recent) < state.best_loss and len(state.recent) == RECENT:
-        state.best, state.best_loss = min(state.passed, key=lambda entry: entry[0])[1], float(np.mean(state.recent))
-    norms = state.norms = {}
+    loss, images = problem.evaluate(state.iteration)
+    state.history.add(loss, before)
+    rate = problem.rate(state.iteration)
+    state.norms = {}
     for name, variable in problem.variables.items():
-        opt = state.optimisers[name]
-        norms[name] = _norm([dr.grad(opt[latent]) for latent in state.latents[name]])
-        _watch(problem, state, name, norms[name])
-        if np.isfinite(loss) and np.isfinite(norms[name]):
-            opt.set_learning_rate({latent: rate * lr for latent, lr in variable.learning_rates.items()})
-            opt.step()
-        for latent, value in variable.constrained({k: dr.detach(opt[k]) for k in state.latents[name]}).items():
-            opt[latent] = value
-            state.latents[name][latent] = opt[latent]
-    journal.step(state.iteration, loss, norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
-                 problem.offsets(before))  # fmt: skip
+        _step(problem, state, name, variable, rate)
+    journal.step(
+        state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
+        problem.offsets(before),
+    )  # fmt: skip
     every = problem.settings.snapshot_every
     if every and state.iteration % every == 0:
         journal.snapshot(state.iteration, problem, images)
     return loss
 
 
-def _norm(grads: list[Any]) -> float:
-    return float(np.sqrt(sum(np.sum(np.square(numbers(g))) for g in grads)))
+def _step(problem: Problem, state: _State, name: str, variable: Any, rate: float) -> None:
+    """Move one variable, unless its gradient is not finite."""
+    opt, latents = state.optimisers[name], state.latents[name]
+    norms = {latent: _norm(dr.grad(opt[latent])) for latent in latents}
+    for latent, norm in norms.items():
+        label = f"{name} ({latent})"
+        state.norms[label] = norm
+        _watch(problem, state, label, norm)
+    if all(map(math.isfinite, norms.values())):
+        opt.set_learning_rate({latent: rate * lr for latent, lr in variable.learning_rates.items()})
+        opt.step()
+    for latent, value in variable.constrained({k: dr.detach(opt[k]) for k in latents}).items():
+        opt[latent] = value
+        latents[latent] = opt[latent]
 
 
-def _watch(problem: Problem, state: _State, name: str, norm: float) -> None:
-    """Warn once if a variable has had no gradient for a while, with the reason that the plan gives."""
-    count = state.without_gradient[name] = state.without_gradient.get(name, 0) + 1 if norm == 0 else 0
-    if count == problem.settings.stalled_after:
-        plan = getattr(problem.integrator, "plan", None)
-        terms = (
-            [f"{t.name} {'runs' if t.runs else 'is out'}: {t.reason}" for t in plan.terms] if plan is not None else []
-        )
-        reason = f"; the latest plan: {'; '.join(terms)}" if terms else ""
-        said = (
-            f"the loss has not depended on '{name}' for {count} iterations (its gradient is 0): is it seen, or does it "
-            f"cast light or shadow on what is seen?{reason}"
-        )
-        warnings.warn(said, StalledWarning, stacklevel=6)
+def _norm(grad: Any) -> float:
+    return float(np.sqrt(np.sum(np.square(numbers(grad)))))
 
 
-def _diverges(problem: Problem, state: _State, loss: float) -> bool:
-    if not np.isfinite(loss):
-        return True
-    if len(state.recent) < RECENT or state.iteration < 2 * RECENT:
-        return False
-    return np.mean(state.recent) > problem.settings.diverged_factor * abs(min(state.first_losses))
-
-
-def _about_divergence(state: _State, loss: float) -> str:
-    known = f"the best state (loss {state.best_loss:.3e})" if np.isfinite(state.best_loss) else "the start"
-    return (
-        f"the loss diverged at iteration {state.iteration} (now {loss:.3e}, at first "
-        f"{min(state.first_losses):.3e}): stopped, {known} is kept; lower the learning rates, or raise spp"
+def _watch(problem: Problem, state: _State, label: str, norm: float) -> None:
+    """Count iterations without a gradient; warn once if that lasts, with the reason that the plan gives."""
+    usable = math.isfinite(norm) and norm > 0
+    count = state.lost[label] = 0 if usable else state.lost.get(label, 0) + 1
+    if norm != 0 or count != problem.settings.stalled_after:
+        return
+    plan = getattr(problem.integrator, "plan", None)
+    terms = [f"{t.name} {'runs' if t.runs else 'is out'}: {t.reason}" for t in plan.terms] if plan is not None else []
+    reason = f"; the latest plan: {'; '.join(terms)}" if terms else ""
+    said = (
+        f"the loss has not depended on {label} for {count} iterations (its gradient is 0): is it seen, or does it cast "
+        f"light or shadow on what is seen?{reason}"
     )
-
-
-def _detached(latents: Latents) -> Latents:
-    return {name: {k: type(v)(dr.detach(v)) for k, v in found.items()} for name, found in latents.items()}
+    warnings.warn(said, StalledWarning, stacklevel=7)

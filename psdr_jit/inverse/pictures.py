@@ -50,16 +50,17 @@ def write_curves(path: Path, rows: Sequence[dict[str, Any]]) -> Path:
     figure = Figure(figsize=(8, 3.2), dpi=120, layout="constrained")
     left, right = figure.subplots(1, 2)
     iterations = [row["iteration"] for row in rows]
+    finite = [row["loss"] for row in rows if row["loss"] is not None]
     losses = np.array([row["loss"] for row in rows], dtype=float)
     left.plot(iterations, losses, color="black", linewidth=1)
     left.set_ylabel("loss")
-    if np.nanmin(losses) > 0:
+    if finite and min(finite) > 0:
         left.set_yscale("log")
     styles = ("-", "--", ":", "-.")
     names = [(name, kind) for name in rows[0]["offset"] for kind in rows[0]["offset"][name]] if rows else []
     for k, (name, kind) in enumerate(names):
         values = np.array([row["offset"][name][kind] for row in rows])
-        scale = values.max() or 1.0
+        scale = float(values.max()) or 1.0
         right.plot(iterations, np.maximum(values / scale, 1e-6), styles[k % len(styles)], color=str(0.6 * (k // 4) / 3),
                    linewidth=1, label=f"{name.split('.')[0]}: {kind} (1 = {scale:.3g})")  # fmt: skip
     right.set_yscale("log")

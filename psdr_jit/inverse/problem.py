@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,8 +17,8 @@ from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
-from psdr_jit.inverse.variables import Variable, numbers
-from psdr_jit.params import values_to_keep
+from psdr_jit.inverse.variables import Variable
+from psdr_jit.params import is_transform, parameter_value
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
 
@@ -38,6 +38,19 @@ class Problem:
     integrator: Any
     settings: Settings
     own: Latents  # at the scene's own values
+    fingerprint: str  # changes with whatever makes a stored state meaningless; targets apart
+    target_means: np.ndarray  # by view: renders of one target may differ by rounding
+
+    @property
+    def period(self) -> int:
+        """Iterations in which every view is seen."""
+        few = self.settings.views_per_step
+        return 1 if few == 0 else -(-len(self.views) // few)
+
+    def rate(self, iteration: int) -> float:
+        """Factor of the learning rates: 1 in the first iteration, `decay` in the last."""
+        last = max(1, self.settings.iterations - 1)
+        return self.settings.decay ** (iteration / last)
 
     def chosen(self, iteration: int) -> list[int]:
         """Views of an iteration: all, or the next few of a random order that is drawn anew for each round."""
@@ -62,24 +75,26 @@ class Problem:
             self.params.set_dirty(name)  # equal values are skipped, but an attached one must replace a detached one
         self.params.update()
 
-    def evaluate(self, iteration: int, attached: bool = True) -> tuple[float, dict[int, np.ndarray]]:
-        """Loss of the views of an iteration and, if `attached`, its gradient, added to that of the scene's parameters.
+    def evaluate(self, iteration: int) -> tuple[float, dict[int, np.ndarray]]:
+        """Loss of the views of an iteration; its gradient is added to that of the scene's parameters.
 
         All views see one state of the scene. Their gradients meet in its parameters, and only then go on to the
-        latents: else the first view would use up the graph between them.
+        latents: else the first view would use up the graph between them. A loss that is not finite, or whose
+        derivative by the image is not, ends this with NaN and leaves the rest undone.
         """
         total, images = 0.0, {}
         chosen = self.chosen(iteration)
         with dr.isolate_grad():
             for k in chosen:
                 loss, image, grad = self._view(iteration, k)
-                total += loss / len(chosen)
                 images[k] = image
-                if attached:
-                    self.integrator.render_backward(
-                        self.scene, self.params, grad / len(chosen), sensor=self.views[k].sensor,
-                        seed=self.seed(iteration, k, GRADIENT), spp=self.settings.gradient_spp or self.settings.spp,
-                    )  # fmt: skip
+                if not (np.isfinite(loss) and dr.all(dr.isfinite(grad), axis=None)):
+                    return float("nan"), images
+                total += loss / len(chosen)
+                self.integrator.render_backward(
+                    self.scene, self.params, grad / len(chosen), sensor=self.views[k].sensor,
+                    seed=self.seed(iteration, k, GRADIENT), spp=self.settings.gradient_spp or self.settings.spp,
+                )  # fmt: skip
         return total, images
 
     def _view(self, iteration: int, k: int) -> tuple[float, np.ndarray, mi.TensorXf]:
@@ -93,15 +108,15 @@ class Problem:
                 images.append(mi.TensorXf(dr.detach(image)))
         dr.enable_grad(images)
         loss = self.loss.function(*images, view.target)
-        if not dr.is_array_v(loss) or dr.width(loss) != 1:
-            raise ParameterError(
-                f"the loss '{self.loss.name}' returned {type(loss).__name__} with {dr.width(loss)} "
-                "numbers: expected one, such as dr.mean(..., axis=None)"
-            )
-        if not dr.grad_enabled(loss):
+        if not dr.is_array_v(loss) or not dr.grad_enabled(loss):
             raise ParameterError(
                 f"the loss '{self.loss.name}' does not depend on the image: compute it with Dr.Jit functions "
                 "(NumPy and PyTorch are not tracked; see dr.wrap)"
+            )
+        if dr.width(loss) != 1:
+            raise ParameterError(
+                f"the loss '{self.loss.name}' returned {type(loss).__name__} with {dr.width(loss)} numbers: expected "
+                "one, such as dr.mean(..., axis=None)"
             )
         dr.backward(loss)
         grad = sum(dr.grad(image) for image in images)
@@ -119,23 +134,12 @@ class Problem:
         for k, (name, variable) in enumerate(self.variables.items()):
             rng = None if seed is None else np.random.default_rng((seed, k))
             found[name] = variable.start(self.own[name], rng)
-        return found
+        return copied(found)  # the optimisers must not step the scene's own values
 
-    def fingerprint(self) -> str:
-        """Changes with whatever makes a stored state meaningless."""
-        digest = hashlib.sha256()
-        ignored = {"iterations", "checkpoint_every", "snapshot_every", "max_seconds"}  # may change on resuming
-        settings = {key: value for key, value in asdict(self.settings).items() if key not in ignored}
-        kinds = {name: type(v).__name__ for name, v in self.variables.items()}
-        rates = {name: dict(v.learning_rates) for name, v in self.variables.items()}
-        digest.update(json.dumps([settings, kinds, rates, self.loss.name, str(self.integrator)], sort_keys=True,
-                                 default=str).encode())  # fmt: skip
-        for view in self.views:
-            digest.update(np.array(view.target).tobytes())
-        for latents in self.own.values():
-            for value in latents.values():
-                digest.update(numbers(value).tobytes())
-        return digest.hexdigest()
+
+def copied(latents: Mapping[str, Mapping[str, Any]]) -> Latents:
+    """Detached copies."""
+    return {name: {k: type(v)(dr.detach(v)) for k, v in found.items()} for name, found in latents.items()}
 
 
 def make_problem(
@@ -167,20 +171,31 @@ def make_problem(
                 )
     if not hasattr(integrator, "render_backward"):
         integrator = integrators.build(integrators.integrator_spec(scene, integrator))
-    problem = Problem(
-        scene, params, found, {v.parameter: v for v in chosen}, find_loss(loss), integrator, settings, own
-    )
-    return problem
+    by_name = {v.parameter: v for v in chosen}
+    loss = find_loss(loss)
+    digest = _fingerprint(params, by_name, found, loss, integrator, settings)
+    means = np.array([np.mean(np.array(view.target)) for view in found])
+    return Problem(scene, params, found, by_name, loss, integrator, settings, own, digest, means)
 
 
-def with_settings(problem: Problem, **changes: Any) -> Problem:
-    """The same problem, run in another way."""
-    return replace(problem, settings=replace(problem.settings, **changes))
+def _fingerprint(params: Any, variables: Any, found: Any, loss: Loss, integrator: Any, settings: Settings) -> str:
+    """Of everything that was asked for, and of the scene."""
+    ignored = {"iterations", "checkpoint_every", "snapshot_every", "max_seconds"}  # may change on resuming
+    asked = {key: value for key, value in asdict(settings).items() if key not in ignored}
+    kinds = {name: [type(v).__name__, _asked(v), dict(v.learning_rates)] for name, v in variables.items()}
+    digest = hashlib.sha256()
+    whole = [asked, kinds, [view.name for view in found], loss.name, str(integrator)]
+    digest.update(json.dumps(whole, sort_keys=True, default=str).encode())
+    for name in sorted(params.keys()):
+        value = parameter_value(params, name)
+        value = value.matrix if is_transform(value) else value
+        digest.update(name.encode())
+        digest.update(np.array(dr.detach(value)).tobytes() if dr.is_array_v(value) else repr(value).encode())
+    return digest.hexdigest()
 
 
-def scene_values(problem: Problem) -> dict[str, Any]:
-    """Copies of what the variables change in the scene."""
-    kept = {}
-    for name in problem.variables:
-        kept |= values_to_keep(problem.params, name)
-    return kept
+def _asked(variable: Variable) -> dict[str, Any]:
+    """What a variable was made with."""
+    if not is_dataclass(variable):
+        return {}
+    return {f.name: getattr(variable, f.name) for f in fields(variable) if f.init}

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import mitsuba as mi
+from drjit import opt
 
 from psdr_jit.errors import OptionError
 
-OPTIMIZERS = ("adam", "adamw", "sgd", "rmsprop")
+PLUGINS = {"adam": opt.Adam, "adamw": opt.AdamW, "sgd": opt.SGD, "rmsprop": opt.RMSProp}  # those of mi.ad
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,20 @@ class Settings:
             wrong.append(f"diverged_factor = {self.diverged_factor!r}: expected a number above 1")
         if self.max_seconds is not None and not (_is_number(self.max_seconds) and self.max_seconds > 0):
             wrong.append(f"max_seconds = {self.max_seconds!r}: expected a number above 0")
-        if not isinstance(self.optimizer, Mapping) or self.optimizer.get("type") not in OPTIMIZERS:
-            wrong.append(f"optimizer = {self.optimizer!r}: its type must be one of {', '.join(OPTIMIZERS)}")
+        if not isinstance(self.optimizer, Mapping) or self.optimizer.get("type") not in PLUGINS:
+            wrong.append(f"optimizer = {self.optimizer!r}: its type must be one of {', '.join(PLUGINS)}")
+        else:
+            known = set(inspect.signature(PLUGINS[self.optimizer["type"]].__init__).parameters) - {
+                "self",
+                "lr",
+                "params",
+            }
+            unknown = sorted(set(self.optimizer) - known - {"type"})
+            if unknown:
+                wrong.append(
+                    f"optimizer '{self.optimizer['type']}' has no option {', '.join(map(repr, unknown))}: it has "
+                    f"{', '.join(sorted(known))}"
+                )
         if wrong:
             raise OptionError("; ".join(wrong))
 
@@ -56,9 +69,8 @@ class Settings:
         kind = self.optimizer["type"]
         if kind in ("adam", "adamw"):
             options.setdefault("uniform", uniform)
-        plugin = {"adam": mi.ad.Adam, "adamw": mi.ad.AdamW, "sgd": mi.ad.SGD, "rmsprop": mi.ad.RMSProp}[kind]
         try:
-            return plugin(lr=1.0, **options)
+            return PLUGINS[kind](lr=1.0, **options)
         except (TypeError, RuntimeError) as error:
             raise OptionError(f"optimizer '{kind}': {error}") from error
 

@@ -17,7 +17,7 @@ from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.scene_io import find_sensor
 from psdr_jit.upload import uploaded
 
-#: Seed of rendered targets: far from those that a loop counts up from 0.
+#: Seed of rendered targets.
 TARGET_SEED = 0x7A26E7
 
 #: Samples per pixel of a target that are rendered at once.

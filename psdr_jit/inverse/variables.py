@@ -155,6 +155,8 @@ class Pose:
                 raise OptionError(f"'{self.parameter}': {name}_axes = {axes!r}: expected letters out of xyz, each once")
         if not self.shift_axes and not self.turn_axes:
             raise OptionError(f"'{self.parameter}': it may neither shift nor turn; give shift_axes or turn_axes")
+        if info.shape != (4, 4) and last == "position" and (self.turn_axes or self.pivot is not None):
+            raise OptionError(f"'{self.parameter}' is a point and cannot turn: leave out turn_axes and pivot")
         if self.turn_axes and not self.turn_rate > 0:
             raise OptionError(f"'{self.parameter}': turn_axes need a turn_rate [degrees per step] above 0")
         self._base = copy_of(params[self.parameter])
@@ -169,16 +171,15 @@ class Pose:
         found = {}
         for name, value, spread in (("shift", self.start_shift, self.spread_shift),
                                     ("turn", np.deg2rad(self.start_turn), np.deg2rad(self.spread_turn))):  # fmt: skip
+            move = broadcast(value, (3,), f"the start_{name} of '{self.parameter}'")
+            allowed = np.array([axis in self._axes(name) for axis in AXES])
+            if np.any(move[~allowed]):
+                raise OptionError(
+                    f"'{self.parameter}': it starts displaced along or about an axis that is not "
+                    f"among {name}_axes = {self._axes(name)!r} and could never come back"
+                )
             if name in latents:
-                move = broadcast(value, (3,), f"the start_{name} of '{self.parameter}'")
-                allowed = np.array([axis in self._axes(name) for axis in AXES])
-                if rng is not None:
-                    move = move + spread * rng.uniform(-1, 1, 3) * allowed
-                if np.any(move[~allowed]):
-                    raise OptionError(
-                        f"'{self.parameter}': it starts displaced along or about an axis that is not "
-                        f"among {name}_axes = {self._axes(name)!r} and could never come back"
-                    )
+                move = move if rng is None else move + spread * rng.uniform(-1, 1, 3) * allowed
                 found[name] = like(latents[name], move)
         return found
 

@@ -23,9 +23,10 @@ def test_every_mistake_of_a_file_is_reported_at_once(llvm, tmp_path):
     with pytest.raises(OptionError) as caught:
         config.read(path)
     text = str(caught.value)
-    for words in ("8 mistakes", "'sppp'; did you mean 'spp'?", "iterations = 0", "'rendr'; did you mean 'render'?",
+    for words in ("9 mistakes", "'sppp'; did you mean 'spp'?", "iterations = 0", "'rendr'; did you mean 'render'?",
                   "either file or render", "'turnrate'; did you mean 'turn_rate'?", "kind = 'params'",
-                  "learning_rate = 'fast': expected a number", "'targets'; did you mean 'target'?"):  # fmt: skip
+                  "learning_rate = 'fast': expected a number", "'max_dept'; did you mean 'max_depth'?",
+                  "'targets'; did you mean 'target'?"):  # fmt: skip
         assert words in text, (words, text)
 
 
@@ -39,6 +40,37 @@ def test_files_that_are_not_there(llvm, tmp_path):
             config.read(write_config(tmp_path, **{old: new}))
     with pytest.raises(OptionError, match="does not exist"):
         config.read(tmp_path / "missing.toml")
+
+
+def test_values_of_another_type(llvm, tmp_path):
+    for old, new, words in (
+        ("[integrator]\nmax_depth = 2", "", None),
+        ("[defaults]\nres = 16", "", None),
+        ('kind = "pose"', 'kind = ["pose"]', "expected one of parameter, pose"),
+        ("render = 64", "render = 64\nsensor = [[0]]", "an index or a list of them"),
+        ("render = 64", 'render = 64\nsensor = "a"', "an index or a list of them"),
+        ("render = 64", "render = 64.5", "expected a whole number"),
+        ("lower = 0.5", 'lower = "0"', "expected a number"),
+        ('turn_axes = "y"', "turn_axes = 3", "expected a text"),
+        ("start_shift = [0.2, 0.0, -0.1]", 'start_shift = ["a", 0, 0]', "a list of three numbers"),
+        ("start_at = 8.0", 'start_at = "bright"', "a number or a list of numbers"),
+        ("seed = 7", "perturb = -1", "from 0 on"),
+        ("seed = 7", "optimizer = 3", "its type must be one of"),
+        ("seed = 7", 'optimizer = { type = "sgd", beta_1 = 0.9 }', "has no option 'beta_1'"),
+        ("seed = 7", 'loss = ["l2"]', "expected one of l1"),
+        ("iterations = 20", "iterations = 20.0", "expected a whole number"),
+    ):
+        path = write_config(tmp_path, **{old: new})
+        if words is None:
+            assert config.read(path).variables
+            continue
+        with pytest.raises(OptionError, match=words):
+            config.read(path)
+    for table in ("defaults", "integrator"):
+        text = write_config(tmp_path).read_text().replace(f"[{table}]", f"[{table}s]")
+        (tmp_path / "config.toml").write_text(f'{table} = "prb"\n' + text)
+        with pytest.raises(OptionError, match=f"expected a table, .{table}"):
+            config.read(tmp_path / "config.toml")
 
 
 def test_properties_that_the_integrator_does_not_have(llvm, tmp_path):
@@ -87,6 +119,8 @@ def test_variables(llvm):
         ([Pose(BOX, 0.1, turn_axes="q")], OptionError, "letters out of xyz"),
         ([Pose(BOX, 0.1, turn_axes="y")], OptionError, "turn_rate"),
         ([Pose(BOX, 0.0)], OptionError, "must be above 0"),
+        ([Pose("lamp.position", 0.1, turn_axes="y", turn_rate=1)], OptionError, "a point and cannot turn"),
+        ([Pose("lamp.position", 0.1, pivot=(0, 0, 0))], OptionError, "a point and cannot turn"),
         ([Parameter("camera.near_clip", 0.1)], ParameterError, "cannot be differentiated"),
     ):
         with pytest.raises(error, match=words):

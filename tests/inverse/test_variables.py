@@ -76,6 +76,19 @@ def test_pose_of_a_camera_is_in_its_own_frame(llvm):
     assert np.allclose(after[:3, 3], before[:3, 3] + before[:3, 2], atol=1e-5)  # forward
 
 
+def test_a_camera_turns_about_its_pivot(llvm):
+    scene = scene_of()
+    pivot = np.array([0.0, -0.5, 0.0])
+    pose = Pose("camera.to_world", 0.1, turn_rate=1, turn_axes="y", start_turn=(0, 90, 0), pivot=pivot)
+    before = np.array(mi.traverse(scene)["camera.to_world"].matrix).reshape(4, 4)[:3, 3]
+    latents = pose.start(begin(pose, scene), None)
+    after = np.array(pose.value(latents).matrix).reshape(4, 4)[:3, 3]
+    arm = before - pivot
+    assert np.allclose(after, pivot + [arm[2], arm[1], -arm[0]], atol=1e-5)
+    moved = {"distance": np.linalg.norm(after - before), "angle_degrees": 90}
+    assert pose.offset(latents) == pytest.approx(moved, rel=1e-4)
+
+
 def test_axes_that_may_not_move_do_not(llvm):
     scene = scene_of()
     pose = Pose(BOX, 0.1, shift_axes="xz", spread_shift=0.3)
@@ -85,6 +98,9 @@ def test_axes_that_may_not_move_do_not(llvm):
     dr.enable_grad(latents["shift"])
     dr.backward(dr.sum(pose.value(latents)))
     assert np.array(dr.grad(latents["shift"])).ravel()[1] == 0
+    with pytest.raises(OptionError, match="never come back"):
+        turned = Pose(BOX, 0.1, start_turn=(0, 30, 0))
+        turned.start(begin(turned, scene), None)
     with pytest.raises(OptionError, match="never come back"):
         stuck = Pose(BOX, 0.1, shift_axes="x", start_shift=(0, 1, 0))
         stuck.start(begin(stuck, scene), None)

@@ -53,6 +53,15 @@ def test_forward_and_backward_mode_agree(moved):
     assert float(dr.grad(θ)[0]) == pytest.approx(expected, rel=1e-4)
 
 
+def test_budgets_are_those_that_were_set(moved):
+    motion = moved
+    integrator = psdr(sppc=7, sppp=9, sppi=11)
+    motion.attach()
+    integrator.render_forward(motion.scene, motion.params, seed=5)
+    spp = {term.name: term.spp for term in integrator.plan.terms if term.runs}
+    assert spp == {"interior": 7, "primary": 9, "direct": 11}
+
+
 def test_derivative_is_that_of_each_sensor(moved):
     motion = moved
     motion.attach()

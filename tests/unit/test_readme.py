@@ -12,6 +12,7 @@ import pytest
 
 import psdr_jit
 from psdr_jit.cli import main
+from psdr_jit.inverse import config
 from psdr_jit.options import Options
 from psdr_jit.support import support_table
 from psdr_jit.terms import TERMS
@@ -39,14 +40,48 @@ def test_terms_are_those_of_the_integrator():
     assert rows == [(term.name, term.budget) for term in TERMS]
 
 
+EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+
+
+def run_example(text: str, names: dict | None = None) -> dict:
+    names = {} if names is None else names
+    exec(compile(text, "README.md", "exec"), names)
+    return names
+
+
 def test_python_example_runs(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    (example,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-    names: dict = {}
-    exec(compile(example, "README.md", "exec"), names)
+    names = run_example(EXAMPLES[0])
     gradient = np.array(names["dr"].grad(names["params"]["small-box.vertex_positions"]))
     assert gradient.size == 24 and np.isfinite(gradient).all() and gradient.any()
     assert capsys.readouterr().out
+
+
+def test_optimisation_examples_run(monkeypatch, tmp_path):
+    """In Python, and from there on in PyTorch where it is installed."""
+    monkeypatch.chdir(tmp_path)
+    assert len(EXAMPLES) == 3
+    names = run_example(EXAMPLES[1])
+    assert names["result"].offsets["blocker.vertex_positions"]["distance"] < 0.05
+    pytest.importorskip("torch")
+    image = run_example(EXAMPLES[2], names)["image"]
+    assert tuple(image.shape) == (32, 32, 3) and image.requires_grad
+
+
+def test_configuration_example_is_right(tmp_path):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    (text,) = re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)
+    (tmp_path / "photo.exr").touch()
+    (tmp_path / "shadow.xml").write_text((ROOT / "scenes" / "inverse" / "shadow.xml").read_text())
+    (tmp_path / "config.toml").write_text(text)
+    assert config.read(tmp_path / "config.toml").settings.iterations == 400
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenes" / "inverse").glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_configurations_are_right(path):
+    assert config.read(path).variables
 
 
 def test_xml_line_loads():
