@@ -37,15 +37,14 @@ def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
     return list(zip(i[cuts].tolist(), j[cuts].tolist(), strict=True))
 
 
-def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], said: dict) -> None:
-    """Name the pairs of `(shape, plugin)` whose intersection curve is not looked for, once each."""
-    boxes = [box_of(shape) for shape, _ in shapes]
-    for i, j in crossing(boxes):
+def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], said: dict) -> None:
+    """Name those of the crossing `pairs` of `(shape, plugin)` whose curve is not looked for, once each."""
+    for i, j in pairs:
         (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
         covered = not curved or curved == ["sphere"]
         key = ("pair", a.id(), b.id())
-        if not covered and key not in said and not (curved == ["sphere", "sphere"] and _apart(boxes[i], boxes[j])):
+        if not covered and key not in said and not (curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))):
             said[key] = True
             warnings.warn(
                 f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) may cut into each other: the curve where they "

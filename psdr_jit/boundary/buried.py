@@ -15,7 +15,6 @@ from ..edge_rows import EdgeRows
 from ..job import Job
 from ..scene_analysis import EmitterFacts, ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box
-from ..shape_pairs import box_of, crossing
 
 #: Faces of a body up to which edges are looked for inside of it: each edge is compared with each of its faces.
 MAX_FACES = 64
@@ -24,15 +23,12 @@ MAX_FACES = 64
 DEPTH, ROUNDING = 1e-4, 1e-6
 
 
-def buried(job: Job, rows: EdgeRows, frame: SensorFrame) -> mi.Bool | None:
-    """Rows that lie inside of a solid body. None if no shapes overlap so that there could be any."""
-    shapes = job.scene.shapes()
-    known = [s for s in job.facts.shapes if s.index >= 0]
-    overlapping = {k for pair in crossing([box_of(shapes[s.index]) for s in known]) for k in pair}
+def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts], frame: SensorFrame) -> mi.Bool | None:
+    """Rows that lie inside of one of `bodies`. None if none of these can hide anything."""
     found = None
-    for body in (known[k] for k in sorted(overlapping)):
+    for body in bodies:
         if _may_hide(job, body, frame):
-            inside = _is_inside(shapes[body.index], body, rows, job.facts.reach)
+            inside = _is_inside(job.scene.shapes()[body.index], body, rows, job.facts.reach)
             found = inside if found is None else found | inside
     return found
 

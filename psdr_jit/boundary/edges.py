@@ -17,7 +17,7 @@ from ..job import Job
 from ..junctions import Ball
 from ..scene_analysis import ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box, sensor_frame
-from ..shape_pairs import warn_about_pairs
+from ..shape_pairs import box_of, crossing, warn_about_pairs
 from ..velocities import vertex_speeds
 from .buried import buried
 from .edge_points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
@@ -104,8 +104,10 @@ def _edge_table(job: Job) -> EdgeTable:
     chosen = [s for s in job.facts.shapes if s.index >= 0]
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
-    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], job.cache)
-    segments, buried_count = _without_buried(job, _segments(job, meshes, balls))
+    pairs = crossing([box_of(shapes[s.index]) for s in chosen])
+    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.cache)
+    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
+    segments, buried_count = _without_buried(job, _segments(job, meshes, balls), overlapping)
     if segments.rows is not None:
         outside = _seen_from_outside(job, meshes)
         rows = segments.rows  # not in place: the arrays may be those of the cached topology
@@ -121,12 +123,12 @@ def _edge_table(job: Job) -> EdgeTable:
     return EdgeTable(segments, curves, mi.UInt32([int(s.moves) for s in analytic]), centre, buried_count)
 
 
-def _without_buried(job: Job, segments: EdgeSet) -> tuple[EdgeSet, int]:
+def _without_buried(job: Job, segments: EdgeSet, bodies: list[ShapeFacts]) -> tuple[EdgeSet, int]:
     """Straight edges that a path may reach, and how many others there are."""
     # while a function is being frozen, values cannot be read: nothing is left out
     if segments.rows is None or not job.plan.prunes or dr.flag(dr.JitFlag.FreezingScope):
         return segments, 0
-    hidden = buried(job, segments.rows, shared_frame(job))
+    hidden = buried(job, segments.rows, bodies, shared_frame(job))
     count = 0 if hidden is None else int(dr.count(hidden)[0])
     if count == 0:
         return segments, 0

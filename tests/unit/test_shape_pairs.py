@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from psdr_jit.errors import UnsupportedWarning
-from psdr_jit.shape_pairs import crossing, warn_about_pairs
+from psdr_jit.shape_pairs import box_of, crossing, warn_about_pairs
 
 UNIT = np.array([[-1, -1, -1], [1, 1, 1]], float)
 FLOOR = np.array([[-5, 0, -5], [5, 0, 5]], float)
@@ -37,17 +37,21 @@ def shapes(**kinds):
             for name, (kind, to_world) in kinds.items()]  # fmt: skip
 
 
+def pairs_of(found):
+    return crossing([box_of(shape) for shape, _ in found])
+
+
 def test_uncovered_pairs_are_named_once(llvm):
     T = mi.ScalarTransform4f
     found = shapes(tube=("cylinder", T()), floor=("rectangle", T().translate([0, 0, 0.5]).scale(3)),
                    box=("cube", T().translate([0, 0, 9])))  # fmt: skip
     said = {}
     with pytest.warns(UnsupportedWarning, match="'tube' .cylinder. and 'floor'") as caught:
-        warn_about_pairs(found, said)
+        warn_about_pairs(found, pairs_of(found), said)
     assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_about_pairs(found, said)
+        warn_about_pairs(found, pairs_of(found), said)
 
 
 @pytest.mark.parametrize(("shift", "count"), [(0.5, 1), (2.5, 0), (1.95, 0)])
@@ -58,7 +62,7 @@ def test_two_balls(llvm, shift, count):
     found = shapes(a=("sphere", T()), b=("sphere", T().translate(list(direction))))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about_pairs(found, {})
+        warn_about_pairs(found, pairs_of(found), {})
     assert len(caught) == count
 
 
@@ -67,4 +71,4 @@ def test_covered_pairs_are_not_named(llvm):
     found = shapes(ball=("sphere", T()), floor=("rectangle", T().scale(3)), box=("cube", T().translate([0.3, 0, 0])))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_about_pairs(found, {})
+        warn_about_pairs(found, pairs_of(found), {})
