@@ -113,6 +113,15 @@ def plain_warnings() -> Iterator[None]:
         yield
 
 
+def interrupted(error: BaseException | None) -> bool:
+    """Is Ctrl-C behind this error? Dr.Jit and Mitsuba wrap what is raised while they trace."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script."""
     try:
@@ -129,6 +138,11 @@ def main(argv: list[str] | None = None) -> int:
         print(f"psdr: error: the package '{error.name}' is not installed; see: psdr doctor", file=sys.stderr)
         return SETUP_MISSING
     except KeyboardInterrupt:
+        print("psdr: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except RuntimeError as error:
+        if not interrupted(error):
+            raise
         print("psdr: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:

@@ -1,7 +1,8 @@
 """Recover parameters of a scene from images, as a TOML file says.
 
 Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
-checkpoint; --resume goes on from it with the same seeds and moments. Exit status 1: the loss diverged.
+checkpoint (a second one stops at once, without); --resume goes on from it with the same seeds and moments. Exit status:
+0 done or out of time, 1 the loss diverged, 2 wrong input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import _common
+from psdr_jit.errors import OptionError
 
 NAME = "optimize"
 HELP = "recover parameters of a scene from images"
@@ -24,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: out/ and the name of the file)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
     parser.add_argument("--iterations", type=int, metavar="N", help="instead of those in the file")
-    parser.add_argument("--max-seconds", type=float, metavar="S", help="stop after this time")
+    parser.add_argument(
+        "--max-seconds", type=float, metavar="S", help="stop after the iteration in which this time ends"
+    )
     parser.add_argument("--perturb", type=int, metavar="SEED", help="displace the start at random, within its spread")
     parser.add_argument(
         "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
@@ -39,6 +43,9 @@ def run(args: argparse.Namespace) -> int:
     from psdr_jit.inverse import config as configs
     from psdr_jit.inverse import loop
 
+    _common.require_positive(iterations=args.iterations, max_seconds=args.max_seconds)
+    if args.perturb is not None and args.perturb < 0:
+        raise OptionError(f"--perturb must be from 0 on, got {args.perturb}")
     scene_io.use_variant(args.variant)
     given = {"iterations": args.iterations, "max_seconds": args.max_seconds, "perturb": args.perturb}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -58,9 +65,11 @@ def run(args: argparse.Namespace) -> int:
 
 def describe(result: Any, out: Path, seconds: float) -> str:
     """What became of the run, in a few lines."""
-    lines = [f"{result.status} after {result.iterations} iterations, {seconds:.1f} s; loss {result.loss:.3e}"]
+    loss = f"loss {result.loss:.3e} (mean of the last)"
+    lines = [f"{result.status} after {result.iterations} iterations, {seconds:.1f} s; {loss}"]
     for name, now in result.offsets.items():
         for kind, value in now.items():
             lines.append(f"  {name}: {kind} from the scene file {result.start_offsets[name][kind]:.4g} -> {value:.4g}")
-    resume = "; go on with --resume" if result.status == "interrupted" else ""
-    return "\n".join([*lines, f"log, pictures and values are in {out}{resume}"])
+    left = "log and checkpoint are in {}; go on with --resume" if result.status == "interrupted" else (
+        "log, pictures and values are in {}")  # fmt: skip
+    return "\n".join([*lines, left.format(out)])

@@ -2,7 +2,7 @@
 
 scene = "scene.xml"               # relative to this file
 loss = "l2"                       # l1, l2, relative_l2, dual_l2
-iterations = 100                  # and every other field of `Settings`
+iterations = 100                  # and every other field of `settings.Settings`
 
 [defaults]                        # <default> values of the scene file
 res = 64
@@ -23,7 +23,7 @@ defaults = { mesh = "other.ply" }
 [[variable]]                      # one or more: "parameter", "pose", "vertices" or "profile"
 kind = "pose"
 parameter = "box.vertex_positions"
-learning_rate = 0.01              # and the other fields of that class
+learning_rate = 0.01              # and the other fields of `Parameter`, `Pose`, `Vertices`, `Profile`
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def read(path: str | Path, **changes: Any) -> Config:
 
     path = Path(path)
     if not path.is_file():
-        raise OptionError(f"'{path}' does not exist: check the path")
+        raise OptionError(f"'{path}' is no file: check the path")
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

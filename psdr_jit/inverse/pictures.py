@@ -62,7 +62,7 @@ def write_curves(path: Path, rows: Sequence[dict[str, Any]]) -> Path:
         values = np.array([row["offset"][name][kind] for row in rows])
         scale = float(values.max()) or 1.0
         right.plot(iterations, np.maximum(values / scale, 1e-6), styles[k % len(styles)], color=str(0.6 * (k // 4) / 3),
-                   linewidth=1, label=f"{name.split('.')[0]}: {kind} (1 = {scale:.3g})")  # fmt: skip
+                   linewidth=1, label=f"{name}: {kind}, at most {scale:.3g}")  # fmt: skip
     right.set_yscale("log")
     right.set_ylabel("offset from the scene file")
     for axis in (left, right):

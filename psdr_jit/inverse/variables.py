@@ -87,6 +87,10 @@ class Parameter:
         value = self._own
         if self.start_at is not None:
             value = broadcast(self.start_at, value.shape, f"the start of '{self.parameter}'")
+            low, high = (limit if limit is not None else default
+                         for limit, default in ((self.lower, -np.inf), (self.upper, np.inf)))  # fmt: skip
+            if np.any((value < low) | (value > high)):
+                raise OptionError(f"'{self.parameter}' starts outside of its range from {low} to {high}")
         if rng is not None:
             value = value + self.spread * rng.uniform(-1, 1, value.shape)
         return self.constrained({"value": like(latents["value"], value)})

@@ -38,7 +38,7 @@ def test_files_that_are_not_there(llvm, tmp_path):
                             ("iterations", "iterations =", "not valid TOML")):  # fmt: skip
         with pytest.raises(OptionError, match=words):
             config.read(write_config(tmp_path, **{old: new}))
-    with pytest.raises(OptionError, match="does not exist"):
+    with pytest.raises(OptionError, match="is no file"):
         config.read(tmp_path / "missing.toml")
 
 
@@ -139,9 +139,26 @@ def test_a_loss_of_many_numbers(llvm):
 def test_exit_status_of_the_command(llvm, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main.main(["optimize", "missing.toml"]) == 2
-    assert "does not exist" in capsys.readouterr().err
+    assert "is no file" in capsys.readouterr().err
     path = write_config(tmp_path, 2)
+    for wrong in ("--iterations=0", "--max-seconds=-1", "--perturb=-3"):
+        assert main.main(["optimize", str(path), wrong]) == 2
+        assert wrong.split("=")[0] in capsys.readouterr().err
     assert main.main(["optimize", str(path)]) == 0
     said = capsys.readouterr().out
     assert "finished after 2 iterations" in said and "distance from the scene file" in said
     assert (tmp_path / "out" / "config" / "result.png").is_file()
+
+
+def test_ctrl_c_within_drjit_is_an_interruption(llvm, tmp_path, capsys, monkeypatch):
+    """A second Ctrl-C arrives wherever it does; Dr.Jit wraps it."""
+
+    def wrapped(*args):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from error
+
+    monkeypatch.setattr(config, "problem_of", wrapped)
+    assert main.main(["optimize", str(write_config(tmp_path, 2)), "--out", str(tmp_path / "o")]) == 130
+    assert "interrupted" in capsys.readouterr().err

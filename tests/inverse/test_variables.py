@@ -108,9 +108,14 @@ def test_axes_that_may_not_move_do_not(llvm):
 
 def test_parameters_are_clamped_and_start_where_asked(llvm):
     scene = scene_of()
-    variable = Parameter("blocker.bsdf.reflectance.value", 0.1, lower=0, upper=1, start_at=(0.5, 2, -1))
+    variable = Parameter("blocker.bsdf.reflectance.value", 0.1, lower=0, upper=1, start_at=(0.5, 1, 0))
     latents = begin(variable, scene)
     assert np.array(variable.start(latents, None)["value"]).ravel().tolist() == [0.5, 1, 0]
+    beyond = like(latents["value"], [0.5, 2, -1])
+    assert np.array(variable.constrained({"value": beyond})["value"]).ravel().tolist() == [0.5, 1, 0]
+    with pytest.raises(OptionError, match="outside of its range from 0 to 1"):
+        outside = Parameter("blocker.bsdf.reflectance.value", 0.1, lower=0, upper=1, start_at=(0.5, 2, -1))
+        outside.start(begin(outside, scene), None)
     with pytest.raises(ParameterError, match="one number or 3"):
         wrong = Parameter("blocker.bsdf.reflectance.value", 0.1, start_at=(1, 2))
         wrong.start(begin(wrong, scene), None)
