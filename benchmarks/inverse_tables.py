@@ -16,7 +16,8 @@ UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer
 def outcome_table(found: list[dict[str, Any]]) -> str:
     """Every example and start: the error before, after, and by the peer in equal time."""
     lines = []
-    for case in dict.fromkeys(r["case"] for r in found if not r["case"].startswith(OVERHEAD)):
+    runs = [r for r in found if not r["case"].startswith(OVERHEAD)]
+    for case in dict.fromkeys(r["case"] for r in sorted(runs, key=lambda r: r["family"])):
         of = {r["method"]: r for r in found if r["case"] == case}
         ours, peer = of.get(OURS), of.get(PEER)
         if ours is None or ours["status"] != "ok":
