@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks import rows
 from benchmarks.distances import chamfer
+from benchmarks.inverse_pictures import write_section
 from benchmarks.inverse_tables import OURS, OVERHEAD, PEER
 from benchmarks.suites import Settings
 from psdr_jit.errors import PsdrError
@@ -176,6 +177,8 @@ def run(opened: Opened, chosen: config.Config) -> tuple[dict[str, Any], Path]:
         warnings.simplefilter("ignore")
         result = loop.run(problem, folder)
     after = figures(problem, result.latents)
+    if opened.example.file == "profile":
+        write_section(folder / "section.png", problem, problem.start(), result.latents)
     limits = {name: limit(before[name]) for name, limit in opened.example.limits.items()}
     return {
         "settings": {"iterations": chosen.settings.iterations, "spp": chosen.settings.spp,
@@ -216,5 +219,6 @@ def keep_pictures(opened: Opened, folder: Path) -> None:
     """The strip of images of a run from the example's own start."""
     into = opened.settings.folder / NAME
     into.mkdir(parents=True, exist_ok=True)
-    for name in ("result", "curves"):
-        shutil.copyfile(folder / f"{name}.png", into / f"{opened.example.file}_{name}.png")
+    for name in ("result", "curves", "section"):
+        if (folder / f"{name}.png").is_file():
+            shutil.copyfile(folder / f"{name}.png", into / f"{opened.example.file}_{name}.png")

@@ -108,8 +108,12 @@ def pictures(*names: str) -> str:
 def optimised_pictures() -> str:
     """Links to the strips of images before and after."""
     links = []
-    for path in sorted((rows.RESULTS / "inverse").glob("*_result.png")):
-        words = f"{path.stem.removesuffix('_result')}: initial, final, target, error"
+    words_of = {"result": "initial, final, target, error", "section": "cross-section and displacement"}
+    for path in sorted((rows.RESULTS / "inverse").glob("*.png")):
+        name, _, kind = path.stem.rpartition("_")
+        if kind not in words_of:
+            continue
+        words = f"{name}: {words_of[kind]}"
         links.append(f"![{words}](benchmarks/results/inverse/{path.name})")
     return "\n\n".join(links)
 
