@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .film import black
 from .scene_probes import child_objects, plugin_name
 
 
@@ -48,8 +49,7 @@ def _sensors(batch: mi.Sensor) -> list[mi.Sensor]:
 
 def _format(film: mi.Film) -> tuple[str, int]:
     """Reconstruction filter and number of channels."""
-    film.prepare([])
-    return str(film.rfilter()), int(film.develop().shape[2])
+    return str(film.rfilter()), black(film).shape[2]
 
 
 def _seed(seed: Any, k: int) -> Any:

@@ -56,6 +56,11 @@ def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
     return _parameter(mesh, FACES).array if INDEXED_MESHES else mesh.faces_buffer()
 
 
+def same_faces(a: mi.UInt32, b: mi.UInt32) -> bool:
+    """Do two arrays of corner indices agree? At once if they are one array."""
+    return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
+
+
 def pack_positions(points: mi.Point3f) -> mi.Float | mi.TensorXf:
     """`points` in the form in which the parameter `VERTEX_POSITIONS` is assigned."""
     return mi.TensorXf(points, flip_axes=True) if INDEXED_MESHES else dr.ravel(points)

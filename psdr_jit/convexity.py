@@ -6,11 +6,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .compat import faces_buffer, mesh_faces, mesh_positions
+from .compat import faces_buffer, mesh_faces, mesh_positions, same_faces
 from .mesh_edges import build_edge_topology
 from .mesh_shells import edge_shells
 from .scene_analysis import SceneFacts, ShapeFacts
 from .sensor_frame import origin_box, sensor_frame
+from .shape_pairs import apart
 from .support import SUPPORTED_SENSORS
 
 #: Pairs of a face and a vertex up to which a mesh is looked at.
@@ -25,12 +26,10 @@ def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, cache: di
     if len(facts.shapes) != 1 or facts.sensor.plugin not in SUPPORTED_SENSORS:
         return ""
     only = facts.shapes[0]
-    through = only.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
-    if only.index < 0 or through:
+    if only.index < 0 or not only.opaque:
         return ""
     box, (lower, upper) = scene.bbox(), origin_box(sensor_frame(sensor))
-    outside = any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
-    if not outside:
+    if not apart(lower, upper, box):
         return ""
     flat = only.plugin in ("disk", "rectangle")
     return only.name if flat or is_convex_body(scene.shapes()[0], only, cache) else ""
@@ -50,15 +49,11 @@ def _is_closed(mesh: mi.Mesh, cache: dict) -> bool:
     faces = faces_buffer(mesh)
     key = ("closed", mesh.id())
     known = cache.get(key)
-    if known is None or not _same(known[0], faces):
+    if known is None or not same_faces(known[0], faces):
         p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
         topology = build_edge_topology(p, f)
         cache[key] = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
     return cache[key][1]
-
-
-def _same(a: mi.UInt32, b: mi.UInt32) -> bool:
-    return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
 
 
 def _is_behind_its_faces(mesh: mi.Mesh) -> bool:

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .compat import faces_buffer, mesh_faces, mesh_positions
+from .compat import faces_buffer, mesh_faces, mesh_positions, same_faces
 from .edge_geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .edge_rows import EdgeRows, concatenate
 from .junctions import Ball, JunctionRows, Solid, find_junctions
@@ -118,8 +118,7 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dic
 
 
 def _still_holds(known: _MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
-    same = known.faces.index == buffer.index or bool(dr.all(known.faces == buffer)[0])
-    return same and _welds_hold(known.device, positions, faces)
+    return same_faces(known.faces, buffer) and _welds_hold(known.device, positions, faces)
 
 
 def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:

@@ -62,6 +62,11 @@ class ShapeFacts:
     def moves(self) -> bool:
         return bool(self.geometry)
 
+    @property
+    def opaque(self) -> bool:
+        """No light passes through the surface."""
+        return not self.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+
 
 @dataclass(frozen=True)
 class EmitterFacts:

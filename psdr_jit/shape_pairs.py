@@ -19,6 +19,11 @@ def box_of(shape: mi.Shape) -> np.ndarray:
     return np.array([box.min, box.max], dtype=float)
 
 
+def apart(lower, upper, box: mi.ScalarBoundingBox3f) -> bool:
+    """Does the box with these corners not even touch `box`?"""
+    return any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
+
+
 def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
     """Pairs i < j of boxes (2, 3) whose shapes may cut into each other. Touching is not cutting."""
     if len(boxes) < 2:

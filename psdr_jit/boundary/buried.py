@@ -15,6 +15,7 @@ from ..edge_rows import EdgeRows
 from ..job import Job
 from ..scene_analysis import EmitterFacts, ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box
+from ..shape_pairs import apart
 
 #: Faces of a body up to which edges are looked for inside of it: each edge is compared with each of its faces.
 MAX_FACES = 64
@@ -36,13 +37,11 @@ def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts], frame: SensorFram
 def _may_hide(job: Job, body: ShapeFacts, frame: SensorFrame) -> bool:
     """Is this a body that no path gets into?"""
     shape = job.scene.shapes()[body.index]
-    through = body.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
     small = body.plugin == "sphere" or (body.is_mesh and body.faces <= MAX_FACES)
-    if through or body.is_emitter or body.has_medium or not small:
+    if not body.opaque or body.is_emitter or body.has_medium or not small:
         return False
-    lower, upper = shape.bbox().min, shape.bbox().max
     starts = [origin_box(frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
-    outside = all(any(a[i] > upper[i] or b[i] < lower[i] for i in range(3)) for a, b in starts)
+    outside = all(apart(*start, shape.bbox()) for start in starts)
     return outside and is_convex_body(shape, body, job.cache)
 
 

@@ -17,7 +17,7 @@ from ..job import Job
 from ..junctions import Ball
 from ..scene_analysis import ShapeFacts
 from ..sensor_frame import SensorFrame, origin_box, sensor_frame
-from ..shape_pairs import box_of, crossing, warn_about_pairs
+from ..shape_pairs import apart, box_of, crossing, warn_about_pairs
 from ..velocities import vertex_speeds
 from .buried import buried
 from .edge_points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
@@ -69,10 +69,7 @@ def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
     lower, upper = origin_box(shared_frame(job))
     flags = []
     for facts in meshes:
-        box = job.scene.shapes()[facts.index].bbox()
-        apart = any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
-        through = facts.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
-        flags.append(float(apart and not through))
+        flags.append(float(facts.opaque and apart(lower, upper, job.scene.shapes()[facts.index].bbox())))
     return mi.Float(flags)
 
 

@@ -21,6 +21,7 @@ from psdr_jit.errors import CheckpointError
 from psdr_jit.inverse.variables import like, numbers
 
 FORMAT = 1
+NAME = "checkpoint.npz"  # in the folder of a run
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from psdr_jit import integrators, scene_io
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse.losses import LOSSES
 from psdr_jit.inverse.problem import Problem, make_problem
-from psdr_jit.inverse.settings import Settings
+from psdr_jit.inverse.settings import Settings, is_number
 from psdr_jit.inverse.shapes import Profile, Vertices
 from psdr_jit.inverse.targets import rendered
 from psdr_jit.inverse.variables import Parameter, Pose
@@ -184,20 +184,16 @@ def _variable(k: int, table: Mapping[str, Any], wrong: list[str]) -> Any:
     return None if missing or bad else kind(**{f.name: table[f.name] for f in own if f.name in table})
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
 def _is_list(value: Any) -> bool:
-    return isinstance(value, list) and all(map(_is_number, value))
+    return isinstance(value, list) and all(map(is_number, value))
 
 
 ACCEPTED = {  # annotation of a variable's field: what to call its values, and which are such
-    "float": ("a number", _is_number),
+    "float": ("a number", is_number),
     "str": ("a text", lambda value: isinstance(value, str)),
     "bool": ("true or false", lambda value: isinstance(value, bool)),
     "Sequence[float]": ("a list of three numbers", lambda value: _is_list(value) and len(value) == 3),
-    "Any": ("a number or a list of numbers", lambda value: _is_number(value) or _is_list(value)),
+    "Any": ("a number or a list of numbers", lambda value: is_number(value) or _is_list(value)),
 }
 
 

@@ -83,7 +83,7 @@ class Journal:
 
     def keep(self, checkpoint: checkpoints.Checkpoint) -> None:
         """Replace the checkpoint."""
-        self._try("checkpoint.npz", lambda: checkpoints.save(self.folder / "checkpoint.npz", checkpoint))
+        self._try(checkpoints.NAME, lambda: checkpoints.save(self.folder / checkpoints.NAME, checkpoint))
 
     def snapshot(self, iteration: int, problem: Any, found: dict[int, np.ndarray]) -> None:
         """The images that the loss has seen, beside their targets."""

@@ -26,8 +26,6 @@ from psdr_jit.inverse.variables import like, numbers
 
 FINISHED, OUT_OF_TIME, DIVERGED, INTERRUPTED = "finished", "out of time", "diverged", "interrupted"
 
-CHECKPOINT = "checkpoint.npz"
-
 #: Relative difference of a target's mean up to which it is the same target: renders differ by rounding.
 SAME_TARGET = 1e-2
 
@@ -75,7 +73,7 @@ def run(
     require_folder(folder, resume)
     state = _begin(problem)
     if resume:
-        _restore(problem, state, checkpoints.load(folder / CHECKPOINT, problem.fingerprint))
+        _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
     journal = Journal(folder, problem, keep=state.iteration)
     losses: list[float] = []
     try:
@@ -104,7 +102,7 @@ def require_folder(folder: Path | None, resume: bool) -> None:
     """Raise `OptionError` if there is nothing to resume from, or an earlier run that would be overwritten."""
     if resume and folder is None:
         raise OptionError("resuming needs the folder of the run that was interrupted")
-    if not resume and folder is not None and (folder / CHECKPOINT).exists():
+    if not resume and folder is not None and (folder / checkpoints.NAME).exists():
         raise OptionError(
             f"'{folder}' holds an earlier run: go on with it by resuming (--resume), choose another folder (--out), or "
             "remove it"

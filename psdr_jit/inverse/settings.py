@@ -40,11 +40,11 @@ class Settings:
         wrong = [f"{name} = {given[name]!r}: expected a whole number from {least[name]} on" for name in bad]
         if self.perturb is not None and not (_is_whole(self.perturb) and self.perturb >= 0):
             wrong.append(f"perturb = {self.perturb!r}: expected a whole number from 0 on")
-        if not (_is_number(self.decay) and 0 < self.decay <= 1):
+        if not (is_number(self.decay) and 0 < self.decay <= 1):
             wrong.append(f"decay = {self.decay!r}: expected a number above 0, at most 1")
-        if not (_is_number(self.diverged_factor) and self.diverged_factor > 1):
+        if not (is_number(self.diverged_factor) and self.diverged_factor > 1):
             wrong.append(f"diverged_factor = {self.diverged_factor!r}: expected a number above 1")
-        if self.max_seconds is not None and not (_is_number(self.max_seconds) and self.max_seconds > 0):
+        if self.max_seconds is not None and not (is_number(self.max_seconds) and self.max_seconds > 0):
             wrong.append(f"max_seconds = {self.max_seconds!r}: expected a number above 0")
         if not isinstance(self.optimizer, Mapping) or self.optimizer.get("type") not in PLUGINS:
             wrong.append(f"optimizer = {self.optimizer!r}: its type must be one of {', '.join(PLUGINS)}")
@@ -79,5 +79,6 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whole or not, but not a truth value."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)

@@ -14,6 +14,7 @@ import numpy as np
 
 from psdr_jit import images
 from psdr_jit.errors import OptionError, ParameterError
+from psdr_jit.film import black
 from psdr_jit.scene_io import find_sensor
 from psdr_jit.upload import uploaded
 
@@ -91,10 +92,7 @@ def rendered(scene: mi.Scene, sensor: Any, integrator: Any, spp: int) -> np.ndar
 
 def image_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
     """(H, W, C) of what a sensor renders."""
-    film = sensor.film()
-    width, height = film.crop_size()
-    film.prepare([])
-    return int(height), int(width), int(film.develop().shape[2])
+    return tuple(black(sensor.film()).shape)
 
 
 def sensor_name(scene: mi.Scene, sensor: mi.Sensor) -> str:
