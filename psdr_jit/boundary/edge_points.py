@@ -41,8 +41,9 @@ ROUNDING_LEAD = 10.0
 #: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
 CURVE_LEAD = 0.02
 
-#: Share of the way from the edge to its face's centroid at which the face's own radiance is taken. On the edge itself
-#: rounding may put the point inside a surface on which the edge rests, and everything it sees would be occluded.
+#: Share of the way from the edge to its face's centroid (beyond a dark fringe: to its apex) at which the face's own
+#: radiance is taken. On the edge itself rounding may put the point inside a surface on which the edge rests, and
+#: everything it sees would be occluded.
 INSET = 3e-4
 
 #: Share of the distance to the edge that the visibility ray leaves out.
@@ -147,8 +148,10 @@ def segment_sides(
     pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
     pi.shape = dr.gather(mi.ShapePtr, edges.shapes, dr.select(use1, rows.shape1, rows.shape0), active & own)
     fringe = _fringe(edges, rows, use1, t, -ω, own & active)
-    uv += fringe * (apex_uv(corners) - uv)
-    pi.prim_uv = uv + INSET * (1 / 3 - uv)
+    apex = apex_uv(corners)
+    uv += fringe * (apex - uv)
+    # Beyond a fringe only the apex is sure to be lit: the way to the centroid may lead back into the dark.
+    pi.prim_uv = uv + INSET * (dr.select(fringe > 0, apex, mi.Point2f(1 / 3)) - uv)
 
     offset, lead = clearance(point.x, dr.norm(rows.p1 - rows.p0), centre, rows.blur)
     beside = point.x + towards * offset * point.side - lead * ω
