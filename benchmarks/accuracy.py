@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks import cases, figures, methods, references, rows
 from benchmarks.measure import Renders
 from benchmarks.suites import REFERENCE, Settings
-from psdr_jit.statistics import GroupedImages, gain
+from psdr_jit.derivative.statistics import GroupedImages, gain
 
 NAME = "accuracy"
 BUDGET = 5.0  # [s]

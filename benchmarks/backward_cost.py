@@ -23,9 +23,9 @@ import numpy as np
 
 from benchmarks import rows
 from benchmarks.measure import measured
-from psdr_jit import scene_io
-from psdr_jit.gradient import DerivativeSampler
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.scene import io as scene_io
 
 BENCH = "backward_cost"
 PARAMETER = "small-box.vertex_positions"

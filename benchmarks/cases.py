@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks import meshes
-from psdr_jit import scene_io
-from psdr_jit.perturbation import Perturbation, perturb
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.scene import io as scene_io
 
 X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 NO_ROULETTE = 100  # a roulette depth beyond every max_depth used here: variances of different methods compare

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import rows
-from psdr_jit import check_gradient, scene_io
+from psdr_jit import check_gradient
+from psdr_jit.scene import io as scene_io
 
 BENCH = "checks"
 #: Standard error of the gain at which a case is decided; the rule asks for 0.007.

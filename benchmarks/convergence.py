@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks import rows
-from psdr_jit import integrators, scene_io
-from psdr_jit.gradient import DerivativeSampler
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.scene import io as scene_io
 
 BENCH = "convergence"
 X, Y = (1, 0, 0), (0, 1, 0)
@@ -50,7 +51,7 @@ CASES = (
 def errors(case: Case, res: int) -> dict[str, Any]:
     scene = scene_io.load_scene(scene_io.shipped_scene(f"{case.scene}.xml"), res=res, **case.load)
     motion = perturb(scene, case.param, case.direction)
-    integrator = integrators.build(integrators.integrator_spec(scene, "psdr_path"))
+    integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, "psdr_path"))
     reference = DerivativeSampler(motion, integrator, 0, REFERENCE_SPP, groups=16, first_seed=FIRST_REFERENCE_SEED)
     reference.add(REFERENCE_RENDERS)
     truth = reference.images.mean()

@@ -22,7 +22,7 @@ from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
 from benchmarks.measure import measured
 from benchmarks.suites import Settings
 from benchmarks.sweeps import Sweep
-from psdr_jit.perturbation import Perturbation
+from psdr_jit.derivative.perturbation import Perturbation
 
 NAME = "cost"
 BUDGET = 1.0  # [s]

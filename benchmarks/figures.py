@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psdr_jit.statistics import block_means
+from psdr_jit.derivative.statistics import block_means
 
 BLOCK = 8  # [px] blocks whose products are taken for independent in the error of the squared bias
 SPLITS = 16  # random halvings of the renders behind the squared bias

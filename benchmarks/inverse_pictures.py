@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psdr_jit.images import save_figure
+from psdr_jit.derivative.images import save_figure
 
 PRISM = "prism.vertex_positions"
 CORNERS = 100  # of the cross-section; the mesh begins with their lower ends

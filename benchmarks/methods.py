@@ -24,10 +24,11 @@ from benchmarks.measure import (
     finite,
     timed,
 )
-from psdr_jit import integrators, scene_io
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.finite_differences import FD_SEED, CentralDifference
+from psdr_jit.derivative.perturbation import Perturbation
 from psdr_jit.errors import PsdrError
-from psdr_jit.finite_differences import FD_SEED, CentralDifference
-from psdr_jit.perturbation import Perturbation
+from psdr_jit.scene import io as scene_io
 
 SPP = 16
 #: How it is said that something cannot be done; Mitsuba's integrators raise plain Exceptions.
@@ -98,7 +99,7 @@ def renders_of(integrator: Any, motion: Perturbation, spp: int) -> Callable[[int
         image, seconds = timed(
             lambda: integrator.render_forward(motion.scene, motion.params, sensor=sensor, seed=seed, spp=spp)
         )
-        return integrators.to_image(dr.detach(image)), seconds
+        return integrator_specs.to_image(dr.detach(image)), seconds
 
     return render
 

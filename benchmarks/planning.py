@@ -18,9 +18,9 @@ from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X, Y
 from benchmarks.measure import FIRST_SEED, finite
 from benchmarks.methods import renders_of
 from benchmarks.suites import Settings
-from psdr_jit import integrators
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.statistics import block_means
 from psdr_jit.errors import PsdrError
-from psdr_jit.statistics import block_means
 
 NAME = "planning"
 BUDGET = 2.0  # [s]
@@ -159,7 +159,8 @@ def _compare(opened: Opened) -> dict[str, dict[str, Any]]:
                      **case.limits, **case.load, "budget": opened.settings.budget},
     }  # fmt: skip
     built = {
-        name: integrators.build({"type": "psdr_path", **case.limits, **options}) for name, options in methods.items()
+        name: integrator_specs.build({"type": "psdr_path", **case.limits, **options})
+        for name, options in methods.items()
     }
     renders = {name: renders_of(integrator, motion, SPP) for name, integrator in built.items()}
     images: dict[str, list] = {name: [] for name in methods}

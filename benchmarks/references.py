@@ -18,8 +18,8 @@ from benchmarks import rows
 from benchmarks.cases import Case
 from benchmarks.figures import Reference
 from benchmarks.methods import OURS, Problem
-from psdr_jit import integrators
-from psdr_jit.gradient import DerivativeSampler
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.gradient import DerivativeSampler
 
 SPP = 64
 FIRST_SEED = 1 << 20
@@ -34,7 +34,7 @@ def path_of(folder: Path, case: Case) -> Path:
 def make(folder: Path, problem: Problem, seconds: float) -> dict[str, Any]:
     """Render for `seconds`, store the halves, return the row that describes them."""
     case = problem.case
-    integrator = integrators.build({"type": OURS.name, **case.limits})
+    integrator = integrator_specs.build({"type": OURS.name, **case.limits})
     sampler = DerivativeSampler(problem.motion, integrator, 0, SPP, groups=GROUPS, first_seed=FIRST_SEED)
     start = time.perf_counter()
     while sampler.seeds < MIN_SEEDS or time.perf_counter() - start < seconds:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import inverse_tables, planning_tables, rows, tables
-from psdr_jit.support import support_table
+from psdr_jit.scene.capabilities import support_table
 
 README = rows.ROOT / "README.md"
 EMPTY = "No rows are stored yet; `psdr bench` makes some."

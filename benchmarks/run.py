@@ -19,9 +19,9 @@ from pathlib import Path
 from benchmarks import rows
 from benchmarks.suites import ON_REQUEST, REFERENCE, SUITES, suite
 from benchmarks.worker import DONE, START
-from psdr_jit import scene_io
 from psdr_jit.cli import _common
 from psdr_jit.errors import PsdrError
+from psdr_jit.scene import io as scene_io
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 QUICK_BUDGET = 2.0  # [s] at most

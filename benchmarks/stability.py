@@ -21,7 +21,7 @@ from benchmarks.accuracy import LOAD, figures_of
 from benchmarks.cases import BLOCKER, SMALL_BOX, Case, X
 from benchmarks.suites import Settings
 from benchmarks.sweeps import Sweep
-from psdr_jit.finite_differences import CentralDifference
+from psdr_jit.derivative.finite_differences import CentralDifference
 
 NAME = "stability"
 BUDGET = 1.5  # [s]

@@ -22,7 +22,7 @@ def main() -> int:
     settings = Settings(Path(request["folder"]), request["budget"], request["variant"])
     import mitsuba as mi
 
-    from psdr_jit import scene_io
+    from psdr_jit.scene import io as scene_io
 
     scene_io.use_variant(settings.variant)
     mi.set_log_level(mi.LogLevel.Error)

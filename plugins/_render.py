@@ -6,14 +6,14 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
-from psdr_jit import film as films
-from psdr_jit.batch import parts_of, share, side_by_side, splits
+from psdr_jit.core import film as films
+from psdr_jit.core.counters import Rejected
+from psdr_jit.driver.prepare import Call, Prepared, prepare
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
-from psdr_jit.plan import Plan
-from psdr_jit.planning import Call, Prepared, prepare
-from psdr_jit.rejected import Rejected
-from psdr_jit.scene_io import find_sensor
+from psdr_jit.plan.plan import Plan
+from psdr_jit.scene.batch_sensor import parts_of, share, side_by_side, splits
+from psdr_jit.scene.io import find_sensor
 
 
 class TermIntegrator(ADIntegrator):

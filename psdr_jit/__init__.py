@@ -10,29 +10,32 @@ Symbols of the papers, and what they are called in the code (`_d`: attached to t
     β, η           path throughput, accumulated relative IOR          β, η
     δL, λ          adjoint radiance, adjoint of a ray's origin        δL, λ_o
 
-Data flows one way: scene → scene_analysis → plan → edge sets and distributions → interior | boundary terms → film →
-image. `planning` walks along it, `pilot` and `noise_log` tell it which form and how many samples.
+Data flows one way, through the rooms (folders) in this order; each imports from those before it only:
+
+    setup → core → scene → paths → plan → edges → sampling → interior, boundary → driver → plugins
+    → derivative → inverse → cli
 """
 
 from __future__ import annotations
 
 __version__ = "0.1.0"
 
-from .drjit_libraries import mitsuba_can_load as _mitsuba_can_load
-from .llvm import apply_saved_choice as _apply_saved_choice
+from .setup.drjit_libraries import mitsuba_can_load as _mitsuba_can_load
+from .setup.llvm import apply_saved_choice as _apply_saved_choice
 
 _apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
 
 if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is wrong
     from . import plugins as plugins  # registers the integrators, now and after every variant switch
-    from .check import CheckResult, check_gradient
-    from .gradient import GradientResult, gradient
+    from .derivative.check import CheckResult, check_gradient
+    from .derivative.gradient import GradientResult, gradient
+    from .derivative.make_plan import make_plan
     from .inverse.optimize import optimize
     from .inverse.shapes import Profile, Vertices
     from .inverse.variables import Parameter, Pose
-    from .params import ParamInfo, differentiable_params
-    from .plan import Plan
-    from .planning import make_plan
+    from .plan.plan import Plan
+    from .scene import io as scene_io  # the name by which scenes are loaded: psdr_jit.scene_io.load_scene
+    from .scene.params import ParamInfo, differentiable_params
 
     __all__ = [
         "CheckResult",
@@ -48,4 +51,5 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "gradient",
         "make_plan",
         "optimize",
+        "scene_io",
     ]

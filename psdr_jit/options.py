@@ -26,7 +26,7 @@ class Options:
 
     Budgets count paths per pixel: an edge sample of the primary and indirect terms takes two, one for each side.
     `None` for a budget means "not set": the runtime `spp`, or else the sampler's count, decides. While none is set,
-    these count for the terms on average, see `pilot`.
+    these count for the terms on average, see `driver.pilot`.
     """
 
     max_depth: int = -1  # path segments, -1: unlimited

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from psdr_jit import scene_io
+from psdr_jit.scene import io as scene_io
 
 RES, VIEWS = 24, 3
 ORIGINS = ([0.7, 2.2, 4], [-1.5, 1.8, 3.5], [2.5, 2.0, 2.5])

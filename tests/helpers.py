@@ -9,14 +9,15 @@ import mitsuba as mi
 import numpy as np
 from problems import Problem
 
-from psdr_jit import integrators, scene_io
-from psdr_jit.finite_differences import CentralDifference
-from psdr_jit.gradient import DerivativeSampler
-from psdr_jit.perturbation import Perturbation, perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.finite_differences import CentralDifference
+from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.scene import io as scene_io
 
 Z_LIMIT = 6.0  # standard errors, of few samples: thousands of comparisons with heavy tails
 POWER = 5.0  # standard errors by which a wrong answer must be off
-TERMS = dict(integrators.term_table("psdr_path"))  # term: its sample budget
+TERMS = dict(integrator_specs.term_table("psdr_path"))  # term: its sample budget
 
 
 # ------------------------------------------------------------------------------------------ scenes and images
@@ -30,12 +31,12 @@ def spec_of(scene: mi.Scene, term: str | None = None, **options) -> dict:
     """Properties of a `psdr_path` with the depths of the scene's own integrator; `term` alone if given."""
     # its own budget is named as well: one that is not set may follow another that is 0
     budgets = {budget: int(name == term) for name, budget in TERMS.items()} if term else {}
-    return integrators.integrator_spec(scene, "psdr_path", **budgets, **options)
+    return integrator_specs.integrator_spec(scene, "psdr_path", **budgets, **options)
 
 
 def forward(motion: Perturbation, spec: dict, seeds: int, spp: int) -> np.ndarray:
     """Derivative images of independent seeds, (seeds, H, W, C)."""
-    sampler = DerivativeSampler(motion, integrators.build(spec), 0, spp, groups=seeds)
+    sampler = DerivativeSampler(motion, integrator_specs.build(spec), 0, spp, groups=seeds)
     sampler.add(seeds)
     assert sampler.not_finite == 0
     return sampler.images.group_means()

@@ -14,32 +14,17 @@ import psdr_jit
 ROOT = Path(psdr_jit.__file__).parent
 MAX_LINES = 300
 
-RANK = {
-    # nothing of ours below
-    "errors": 0, "ad": 0, "support": 0, "records": 0, "statistics": 0, "system_advice": 0, "llvm_probe": 0,
-    "private_apt": 0, "ply": 0, "edge_distribution": 0, "analytic_edges": 0, "streams": 0, "scattering": 0,
-    "low_discrepancy": 0, "rejected": 0, "upload": 0,
-    # host-side descriptions
-    "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
-    "llvm_fetch": 1, "scene_io": 1,
-    "params": 2, "scene_probes": 3, "batch": 4,
-    "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
-    "intersections": 2, "walk_tangents": 2, "perturbation": 3, "llvm": 2,
-    "scene_analysis": 4, "interior": 6, "drjit_libraries": 3,
-    "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "forms": 5, "trial": 5,
-    "job": 6,
-    "edge_rows": 2, "junctions": 6, "junction_points": 7, "shape_pairs": 3,
-    "edge_set": 7,
-    # estimators
-    "boundary": 8, "interior_term": 8,
-    "terms": 9,
-    # plugins and the tools on top of them
-    "pilot": 10, "noise_log": 11, "integrators": 10, "planning": 12, "plugins": 13,
-    "gradient": 14, "finite_differences": 14,
-    "check": 15, "demo": 15, "inverse": 15,
-    "cli": 16,
-}  # fmt: skip
-"""Stage of each module or package; an import must lead to a lower one, or stay within a package."""
+ROOMS = (
+    "errors", "options", "setup", "core", "scene", "paths", "plan", "edges", "sampling", "interior", "boundary",
+    "driver", "plugins", "derivative", "inverse", "cli",
+)  # fmt: skip
+"""Folders (and the modules that lie flat) in the order of import: each may import from those before it only."""
+
+MAX_FLAT = 8
+"""Modules that lie directly in psdr_jit."""
+
+INDEPENDENT = {("interior", "boundary"), ("boundary", "interior")}
+"""Rooms that must not know each other, whatever their order."""
 
 
 def modules() -> dict[str, Path]:
@@ -53,10 +38,10 @@ def modules() -> dict[str, Path]:
 
 
 def imports(name: str, path: Path) -> set[str]:
-    """Names of our modules that a module imports when it is loaded, relative or absolute."""
+    """Names of our modules that a module imports, relative or absolute, on loading or inside of its functions."""
     package = ["psdr_jit", *name.split(".")[:-1]]
     found = set()
-    for node in module_level(ast.parse(path.read_text(encoding="utf-8")).body):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -65,36 +50,52 @@ def imports(name: str, path: Path) -> set[str]:
             found |= {f"{base}.{alias.name}" for alias in node.names}
     known = modules()
     ours = {f.removeprefix("psdr_jit.") for f in found if f.startswith("psdr_jit.")}
-    return {m for f in ours for m in (f, f.rpartition(".")[0]) if m in known}
+    return {m for f in ours for m in (f, f.rpartition(".")[0]) if m in known} - {name}
 
 
-def module_level(body: list[ast.stmt]) -> list[ast.stmt]:
-    """Statements that run on import: not those inside of functions."""
-    found = []
-    for node in body:
-        found.append(node)
-        for block in ("body", "orelse", "finalbody"):
-            if not isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-                found += module_level(getattr(node, block, []))
-    return found
-
-
-def rank(module: str) -> int:
+def room(module: str) -> str:
     top = module.split(".")[0]
-    assert top in RANK, f"give psdr_jit.{module} a stage in RANK: above all it imports, below all that import it"
-    return RANK[top]
+    assert top in ROOMS, f"psdr_jit.{module}: give the room a place in ROOMS, after all that it imports from"
+    return top
 
 
 @pytest.mark.parametrize("module", modules())
 def test_imports_point_one_way(module):
     for imported in imports(module, modules()[module]):
-        same_package = "." in module and module.split(".")[0] == imported.split(".")[0]
-        assert same_package or rank(imported) < rank(module), f"{module} must not import {imported}"
+        own, other = room(module), room(imported)
+        assert ROOMS.index(other) <= ROOMS.index(own), f"{module} must not import {imported}"
+        assert (own, other) not in INDEPENDENT, f"{module} must not know {imported}"
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_no_circles_inside_of_a_room(name):
+    """Modules of one room can be put in an order in which each imports from earlier ones only."""
+    inside = {m for m in modules() if room(m) == name}
+    left = {m: imports(m, modules()[m]) & inside for m in inside}
+    while left:
+        free = {m for m, needs in left.items() if not needs & left.keys()}
+        assert free, f"these import each other: {sorted(left)}"
+        left = {m: needs for m, needs in left.items() if m not in free}
 
 
 def test_the_import_scan_sees_imports():
-    assert {"boundary.primary", "interior_term", "job"} <= imports("terms", modules()["terms"])
-    assert "sensor_frame" in imports("boundary.primary", modules()["boundary.primary"])
+    assert {"boundary.primary", "interior.term", "plan.job"} <= imports("driver.terms", modules()["driver.terms"])
+    assert "core.sensor_frame" in imports("boundary.primary", modules()["boundary.primary"])
+    assert "setup.drjit_libraries" in imports("cli.setup_env", modules()["cli.setup_env"])  # inside of a function
+
+
+def test_every_room_says_what_it_is_for():
+    """And few modules lie flat: a stranger sees the architecture from the list of folders."""
+    flat = [path.name for path in ROOT.glob("*.py") if path.name != "__init__.py"]
+    assert len(flat) <= MAX_FLAT
+    for folder in (f for f in ROOT.iterdir() if f.is_dir() and (f / "__init__.py").is_file()):
+        assert folder.name in ROOMS
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))
+
+
+def test_unit_tests_mirror_the_rooms():
+    folders = {f.name for f in (Path(__file__).parent / "unit").iterdir() if f.is_dir() and f.name != "__pycache__"}
+    assert folders <= {*ROOMS, "benchmarks", "docs"}, "a folder of tests/unit is named after the room that it tests"
 
 
 @pytest.mark.parametrize("module", modules())
@@ -126,7 +127,7 @@ def test_core_imports_without_a_variant_and_sets_none():
     core = [m for m in modules() if m.split(".")[0] not in ("plugins", "cli") and not m.endswith("__main__")]
     code = "; ".join([
         "import mitsuba as mi, importlib, psdr_jit",
-        f"[importlib.import_module('psdr_jit.' + m) for m in {core!r} if m != 'llvm_probe']",
+        f"[importlib.import_module('psdr_jit.' + m) for m in {core!r} if m != 'setup.llvm_probe']",
         "assert mi.variant() is None, mi.variant()",
     ])  # fmt: skip
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -12,7 +12,8 @@ primary terms, so that it differs from `psdr_path` in nothing but where the seco
 and L_i jumps across the image of every edge on the sphere of directions. Reynolds' transport theorem [Zhang et al.
 2019] leaves an integral over that image, a curve with element |τ×ω| dl / r_B whose points move with s·(v_B − u_k) / r_B
 across themselves (s = τ×ω/|τ×ω|, ω from x_k to the edge point x_B, r_B their distance, v_B the edge's velocity, u_k
-that of x_k sliding along its ray, see `psdr_jit/interior.py`). With one edge point of density pdf_len per vertex,
+that of x_k sliding along its ray, see `psdr_jit/interior/sweeps.py`). With one edge point of density pdf_len per
+vertex,
 
     β_k f cosθ (L_− − L_+) s·(v_B − u_k) |τ×ω| / (r_B² pdf_len)
 
@@ -39,23 +40,23 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from psdr_jit import film as films
-from psdr_jit.ad import tangents
-from psdr_jit.boundary.edge_points import EdgePoint, clearance, segment_position
-from psdr_jit.boundary.edge_sources import _open_side
-from psdr_jit.boundary.edges import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
-from psdr_jit.edge_distribution import EdgeDistribution, pmf, sample_edge
-from psdr_jit.edge_rows import EdgeRows
+from psdr_jit.boundary.light_lines import _open_side
+from psdr_jit.core import film as films
+from psdr_jit.core.ad import tangents
+from psdr_jit.core.low_discrepancy import pixel_sampler
+from psdr_jit.core.records import Hit
+from psdr_jit.core.sensor_frame import View
+from psdr_jit.core.streams import Stream, stream_seed
+from psdr_jit.driver.prepare import prepare
+from psdr_jit.edges.points import EdgePoint, clearance, segment_position
+from psdr_jit.edges.rows import EdgeRows
+from psdr_jit.edges.table import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
 from psdr_jit.errors import UnsupportedError
-from psdr_jit.interior_term import _camera_passes
-from psdr_jit.job import Job
-from psdr_jit.low_discrepancy import pixel_sampler
-from psdr_jit.path_steps import SHADOW_EPSILON, NoSink, continue_path, first_hit, walk
-from psdr_jit.planning import prepare
-from psdr_jit.records import Hit
-from psdr_jit.scene_analysis import SceneFacts
-from psdr_jit.sensor_frame import View
-from psdr_jit.streams import Stream, stream_seed
+from psdr_jit.interior.term import _camera_passes
+from psdr_jit.paths.walk import SHADOW_EPSILON, NoSink, continue_path, first_hit, walk
+from psdr_jit.plan.job import Job
+from psdr_jit.sampling.distribution import EdgeDistribution, pmf, sample_edge
+from psdr_jit.scene.facts import SceneFacts
 
 #: Exterior angle that seams without one (split textures or normals) get, so that they are sampled at all [rad].
 LEAST_ANGLE = 1e-2

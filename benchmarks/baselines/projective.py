@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks import cases, meshes
 from benchmarks.cases import Case
-from psdr_jit.mesh_edges import weld_vertices
-from psdr_jit.perturbation import Perturbation
+from psdr_jit.derivative.perturbation import Perturbation
+from psdr_jit.edges.topology import weld_vertices
 
 #: A guide that costs less to build: `prb_projective` reads these from its attributes, not from XML.
 SMALL_OCTREE = {"proj_seed_spp": 16, "octree_extra_leaf_sample": 8, "octree_max_depth": 6}

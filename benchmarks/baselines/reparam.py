@@ -25,10 +25,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit import llvm, scene_io
+from psdr_jit.derivative.perturbation import Perturbation
 from psdr_jit.errors import OptionError, PsdrError, SceneError, SetupError
-from psdr_jit.params import is_transform
-from psdr_jit.perturbation import Perturbation
+from psdr_jit.scene import io as scene_io
+from psdr_jit.scene.params import is_transform
+from psdr_jit.setup import llvm
 
 MITSUBA = "3.4.1"  # the last with the reparameterisation
 REQUIREMENTS = (f"mitsuba=={MITSUBA}", "numpy<2")

@@ -8,8 +8,8 @@ the sensor:
 
 ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the
 edge's material velocity, u_S the emitter point's (the interior term keeps emitter points on their material:
-`interior.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is the
-boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
+`interior/sweeps.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is
+the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both.
@@ -22,20 +22,20 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..edge_distribution import pmf, sample_edge, stratified
-from ..edge_rows import EdgeRows
-from ..job import Job
-from ..low_discrepancy import lane_sampler
-from ..path_steps import SHADOW_EPSILON
-from ..records import Hit
-from ..sensor_frame import SensorFrame
-from ..streams import Stream, stream_seed
-from . import secondary
-from .edge_directions import silhouette_wedges, wedge_measure
-from .edge_sources import source_from_curve, source_from_segment
-from .edges import compact, edge_samples, shared_frame
-from .relevance import SecondaryEdges, can_cast_shadow, secondary_edges
-from .secondary import BoundarySamples, motion_of
+from ..core.low_discrepancy import lane_sampler
+from ..core.records import Hit
+from ..core.sensor_frame import SensorFrame
+from ..core.streams import Stream, stream_seed
+from ..edges.rows import EdgeRows
+from ..edges.table import compact, edge_samples, shared_frame
+from ..paths.walk import SHADOW_EPSILON
+from ..plan.job import Job
+from ..sampling.directions import silhouette_wedges, wedge_measure
+from ..sampling.distribution import pmf, sample_edge, stratified
+from ..sampling.relevance import SecondaryEdges, can_cast_shadow, secondary_edges
+from . import segment_motion
+from .light_lines import source_from_curve, source_from_segment
+from .segment_motion import BoundarySamples, motion_of
 from .sensor_subpath import UNLIMITED_VERTICES, recorded_vertices, subpaths
 
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
@@ -202,9 +202,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the direct boundary along the tangents set on the scene's parameters. Detached."""
-    return secondary.forward(job, _prepared, longest_subpath(job))
+    return segment_motion.forward(job, _prepared, longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the direct boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    secondary.backward(job, _prepared, longest_subpath(job), grad_in)
+    segment_motion.backward(job, _prepared, longest_subpath(job), grad_in)

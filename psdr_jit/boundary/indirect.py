@@ -18,15 +18,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..job import Job
-from ..records import Hit
-from ..streams import Stream
-from . import background, secondary
-from .edge_directions import wedge_measure, wedges
-from .edge_views import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
-from .edges import EdgeTable, shared_frame, sides
-from .relevance import SecondaryEdges, secondary_edges
-from .secondary import BoundarySamples
+from ..core.records import Hit
+from ..core.streams import Stream
+from ..edges.table import EdgeTable, shared_frame, sides
+from ..plan.job import Job
+from ..sampling.directions import wedge_measure, wedges
+from ..sampling.relevance import SecondaryEdges, secondary_edges
+from . import indirect_material, segment_motion
+from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
+from .segment_motion import BoundarySamples
 from .sensor_subpath import SubpathRecords, subpaths
 
 
@@ -102,8 +102,8 @@ def _prepared(job: Job) -> BoundarySamples | None:
 
 
 #: Which edges are sampled, and how the term is estimated, by form.
-EDGES = {"spatial": _spatial_edges, "material": background.background_edges}
-PREPARE = {"spatial": _prepared, "material": background.prepared}
+EDGES = {"spatial": _spatial_edges, "material": indirect_material.background_edges}
+PREPARE = {"spatial": _prepared, "material": indirect_material.prepared}
 
 
 def edge_weights(job: Job) -> mi.Float | None:
@@ -114,9 +114,9 @@ def edge_weights(job: Job) -> mi.Float | None:
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
-    return secondary.forward(job, PREPARE[job.form], longest_subpath(job))
+    return segment_motion.forward(job, PREPARE[job.form], longest_subpath(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    secondary.backward(job, PREPARE[job.form], longest_subpath(job), grad_in)
+    segment_motion.backward(job, PREPARE[job.form], longest_subpath(job), grad_in)

@@ -21,25 +21,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .. import film as films
-from ..ad import backpropagate, tangents
-from ..edge_distribution import EdgeDistribution, pmf, sample_edge, stratified
-from ..job import Job
-from ..low_discrepancy import lane_sampler
-from ..path_steps import NoSink, skip_emitters, walk
-from ..sensor_frame import SensorFrame
-from ..streams import Stream, stream_seed
-from . import film_weights
-from .edge_points import (
-    VISIBILITY_EPSILON,
-    EdgePoint,
-    curve_row_point,
-    segment_point,
-)
-from .edges import (
+from ..core import film as films
+from ..core.ad import backpropagate, tangents
+from ..core.low_discrepancy import lane_sampler
+from ..core.sensor_frame import SensorFrame
+from ..core.streams import Stream, stream_seed
+from ..edges.points import VISIBILITY_EPSILON, EdgePoint, curve_row_point, segment_point
+from ..edges.table import (
     EdgeTable,
     compact,
-    distribution_of,
     edge_motion,
     edge_samples,
     row_moves,
@@ -47,6 +37,10 @@ from .edges import (
     shared_frame,
     sides,
 )
+from ..paths.walk import NoSink, skip_emitters, walk
+from ..plan.job import Job
+from ..sampling import film_weights
+from ..sampling.distribution import EdgeDistribution, distribution_of, pmf, sample_edge, stratified
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..job import Job
-from ..low_discrepancy import lane_sampler
-from ..path_steps import PathLimits, continue_path
-from ..records import Hit
-from ..scattering import UNIFORM_SHARE, sample_scattering
-from ..sensor_frame import SensorFrame, look_at
-from ..streams import Stream, stream_seed
+from ..core.low_discrepancy import lane_sampler
+from ..core.records import Hit
+from ..core.sensor_frame import SensorFrame, look_at
+from ..core.streams import Stream, stream_seed
+from ..paths.scattering import UNIFORM_SHARE, sample_scattering
+from ..paths.walk import PathLimits, continue_path
+from ..plan.job import Job
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32

@@ -1,0 +1,1 @@
+"""The `psdr` command: a file for each subcommand."""

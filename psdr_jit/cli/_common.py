@@ -85,9 +85,10 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, st
 
 def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:
     """The scene's own `psdr_path` with all its options, or ours with the scene's path lengths."""
-    from psdr_jit import integrators, scene_io
+    from psdr_jit.derivative import integrator_specs
+    from psdr_jit.scene import io as scene_io
 
-    named = getattr(args, "integrator", None) or integrators.DEFAULT_INTEGRATOR
+    named = getattr(args, "integrator", None) or integrator_specs.DEFAULT_INTEGRATOR
     own = scene_io.integrator_properties(args.scene, **definitions(args))
     given: Mapping[str, Any] | str = own if own.get("type") == named else named
-    return integrators.integrator_spec(scene, given, max_depth=args.max_depth)
+    return integrator_specs.integrator_spec(scene, given, max_depth=args.max_depth)

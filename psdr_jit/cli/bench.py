@@ -7,8 +7,8 @@ import os
 import subprocess
 import sys
 
-from psdr_jit import llvm
 from psdr_jit.cli.test import checkout, environment
+from psdr_jit.setup import llvm
 
 NAME = "bench"
 HELP = "measure accuracy, speed and stability (needs a clone)"

@@ -32,14 +32,16 @@ def run(args: argparse.Namespace) -> int:
     _common.require_positive(res=args.res, iterations=args.iterations)
     if args.res % 32:
         raise OptionError(f"--res must be a multiple of 32, got {args.res}")
-    from psdr_jit import demo, images, integrators, scene_io
+    from psdr_jit.cli import demo_run
+    from psdr_jit.derivative import images, integrator_specs
+    from psdr_jit.scene import io as scene_io
 
     out = make_folder(args.out)
     for name in ("gradient.exr", "gradient.png", "recovery.png"):
         images.check_writable(out / name)
     scene_io.use_variant(args.variant)
-    scene = demo.load(args.res)
-    terms = integrators.terms_of(integrators.integrator_spec(scene, args.integrator))
+    scene = demo_run.load(args.res)
+    terms = integrator_specs.terms_of(integrator_specs.integrator_spec(scene, args.integrator))
     print(f"Terms in the gradient: {', '.join(terms) or 'those of ' + str(args.integrator)}.")
     missing = [name for name in SHADOW_TERMS if name not in terms]
     if missing:
@@ -64,10 +66,11 @@ def make_folder(path: str) -> Path:
 
 def show_gradient(args: argparse.Namespace, scene: Any, out: Path) -> None:
     """Part 1: primal, derivative and finite differences in one picture."""
-    from psdr_jit import demo, images
+    from psdr_jit.cli import demo_run
+    from psdr_jit.derivative import images
 
     with _common.progress_bar("gradient ", args.quiet) as report:
-        result, reference = demo.compare(scene, args.integrator, progress=report)
+        result, reference = demo_run.compare(scene, args.integrator, progress=report)
     panels = [("primal", "Cornell box", result.primal),
               ("derivative", f"box moved in x: {' + '.join(result.terms) or 'total'}", result.total),
               ("derivative", "finite differences: everything", reference.mean)]
@@ -82,7 +85,8 @@ def show_gradient(args: argparse.Namespace, scene: Any, out: Path) -> None:
 
 def show_recovery(args: argparse.Namespace, scene: Any, out: Path) -> None:
     """Part 2: move the box back onto the target view."""
-    from psdr_jit import demo, images
+    from psdr_jit.cli import demo_run
+    from psdr_jit.derivative import images
 
     def note(history: Any) -> str:
         k = len(history.losses) - 1
@@ -90,7 +94,7 @@ def show_recovery(args: argparse.Namespace, scene: Any, out: Path) -> None:
                 f"and {history.angle_degrees(k):.1f} degrees")
 
     with _common.progress_bar("recovery ", args.quiet) as report:
-        history = demo.recover_pose(scene, args.integrator, args.iterations,
+        history = demo_run.recover_pose(scene, args.integrator, args.iterations,
                                     progress=lambda done, total, h: report(done, total, note(h)))
     png = images.write_panels(out / "recovery.png", [("primal", "target", history.target),
                                                      ("primal", "start", history.first),

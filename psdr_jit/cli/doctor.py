@@ -12,8 +12,8 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from psdr_jit import drjit_libraries, llvm, llvm_fetch
 from psdr_jit.errors import SetupError
+from psdr_jit.setup import drjit_libraries, llvm, llvm_fetch
 
 NAME = "doctor"
 HELP = "check Python, Mitsuba, Dr.Jit and LLVM"

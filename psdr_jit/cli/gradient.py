@@ -48,9 +48,10 @@ def run(args: argparse.Namespace) -> int:
     """Render, write, check; 0, or 1 for a check that did not pass."""
     _common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
                              check_seconds=args.check_seconds)
-    from psdr_jit import images, integrators, scene_io
-    from psdr_jit.gradient import gradient
-    from psdr_jit.perturbation import perturb
+    from psdr_jit.derivative import images, integrator_specs
+    from psdr_jit.derivative.gradient import gradient
+    from psdr_jit.derivative.perturbation import perturb
+    from psdr_jit.scene import io as scene_io
 
     exr, png = outputs(args)
     scene_io.use_variant(args.variant)
@@ -66,12 +67,12 @@ def run(args: argparse.Namespace) -> int:
     images.write_derivative_png(png, result.total, title)
     if not args.quiet:
         print(describe(result, exr, png))
-    return check(args, scene, parameter, integrators.integrator_spec(scene, spec)) if args.check else OK
+    return check(args, scene, parameter, integrator_specs.integrator_spec(scene, spec)) if args.check else OK
 
 
 def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
     """Where the .exr and the .png go; both can be written."""
-    from psdr_jit import images
+    from psdr_jit.derivative import images
 
     named = Path(args.output or Path(args.scene).stem + "_gradient.exr")
     images.check_writable(named)
@@ -100,7 +101,7 @@ def describe(result: Any, exr: Path, png: Path) -> str:
 
 def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any]) -> int:
     """Run the check and print its verdict."""
-    from psdr_jit.check import check_gradient
+    from psdr_jit.derivative.check import check_gradient
 
     limit = args.check_seconds
     with _common.progress_bar("check", args.quiet) as report:

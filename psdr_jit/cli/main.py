@@ -76,7 +76,7 @@ def prepare_backend(args: argparse.Namespace, restart: bool) -> None:
     variant = getattr(args, "variant", None) or ""
     if variant.startswith(("cuda", "scalar")):
         return
-    from psdr_jit import llvm
+    from psdr_jit.setup import llvm
 
     before = os.environ.get(llvm.VARIABLE)
     choice = llvm.ensure_llvm()

@@ -39,9 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, optimise, report."""
-    from psdr_jit import scene_io
     from psdr_jit.inverse import config as configs
     from psdr_jit.inverse import loop
+    from psdr_jit.scene import io as scene_io
 
     _common.require_positive(iterations=args.iterations, max_seconds=args.max_seconds)
     if args.perturb is not None and args.perturb < 0:

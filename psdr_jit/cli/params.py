@@ -17,8 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table; 0."""
-    from psdr_jit import scene_io
-    from psdr_jit.params import differentiable_params
+    from psdr_jit.scene import io as scene_io
+    from psdr_jit.scene.params import differentiable_params
 
     scene_io.use_variant(args.variant)
     scene = scene_io.load_scene(args.scene, **_common.definitions(args))

@@ -26,7 +26,8 @@ def run(args: argparse.Namespace) -> int:
     """Render and write; 0."""
     _common.require_positive(spp=args.spp)
     _common.require_seed(args.seed)
-    from psdr_jit import images, scene_io
+    from psdr_jit.derivative import images
+    from psdr_jit.scene import io as scene_io
 
     output = images.check_writable(args.output or Path(args.scene).with_suffix(".exr").name)
     if output.suffix.lower() not in (".exr", ".png"):
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
     import mitsuba as mi
 
-    from psdr_jit.integrators import to_image
+    from psdr_jit.derivative.integrator_specs import to_image
 
     image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))
     if output.suffix.lower() == ".exr":

@@ -30,7 +30,7 @@ if not __package__:
     _package.__path__ = [str(Path(__file__).resolve().parents[1])]
     sys.modules["psdr_jit"] = _package
 
-from psdr_jit import private_apt, system_advice  # noqa: E402
+from psdr_jit.setup import private_apt, system_advice  # noqa: E402
 
 SETUP_MISSING = 3  # exit status: the machine lacks something
 MADE, PACKAGES, STAMP = "psdr-made", "psdr-packages", "psdr-stamp"
@@ -207,8 +207,8 @@ def only_project_changed(venv: Path, key: str) -> bool:
 
 def provide_llvm() -> int:
     """Last step, inside the environment: choose an LLVM or fetch one."""
-    from psdr_jit import drjit_libraries, llvm
     from psdr_jit.errors import SetupError
+    from psdr_jit.setup import drjit_libraries, llvm
 
     say("looking for an LLVM that compiles Dr.Jit's kernels ...")
     try:

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import psdr_jit
-from psdr_jit import drjit_libraries, llvm
 from psdr_jit.errors import SetupError
+from psdr_jit.setup import drjit_libraries, llvm
 
 NAME = "test"
 HELP = "run the test suite (needs a clone)"

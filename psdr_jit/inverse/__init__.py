@@ -1,0 +1,1 @@
+"""Recovering parameters from images: variables, losses, the loop, checkpoints."""

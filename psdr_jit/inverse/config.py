@@ -34,7 +34,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from psdr_jit import integrators, scene_io
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse.losses import LOSSES
 from psdr_jit.inverse.problem import Problem, make_problem
@@ -43,6 +43,7 @@ from psdr_jit.inverse.shapes import Profile, Vertices
 from psdr_jit.inverse.targets import rendered
 from psdr_jit.inverse.variables import Parameter, Pose
 from psdr_jit.options import Options
+from psdr_jit.scene import io as scene_io
 
 KINDS = {"parameter": Parameter, "pose": Pose, "vertices": Vertices, "profile": Profile}
 TABLES = ("scene", "loss", "defaults", "integrator", "target", "variable")
@@ -103,8 +104,8 @@ def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config
         wrong.append(f"loss = {loss!r}: expected one of {', '.join(LOSSES)}")
     targets = [_target(path, k, t, wrong) for k, t in enumerate(_tables(content, "target"))]
     variables = [_variable(k, v, wrong) for k, v in enumerate(_tables(content, "variable"))]
-    integrator = {"type": integrators.DEFAULT_INTEGRATOR, **tables["integrator"]}
-    if integrator["type"] == integrators.DEFAULT_INTEGRATOR:
+    integrator = {"type": integrator_specs.DEFAULT_INTEGRATOR, **tables["integrator"]}
+    if integrator["type"] == integrator_specs.DEFAULT_INTEGRATOR:
         _unknown("[integrator]: ", integrator, ["type", *(f.name for f in fields(Options))], wrong)
     try:
         settings = Settings(**{name: content[name] for name in setting_names if name in content})
@@ -200,9 +201,10 @@ ACCEPTED = {  # annotation of a variable's field: what to call its values, and w
 def problem_of(config: Config) -> Problem:
     """Load the scene, render or read the targets. Raises what loading and checking raise."""
     scene = scene_io.load_scene(config.scene, **config.defaults)
-    integrator = integrators.build(integrators.integrator_spec(scene, config.integrator))
-    kept = {key: value for key, value in config.integrator.items() if key in integrators.PATH_OPTIONS}
-    path = integrators.build(integrators.integrator_spec(scene, kept | {"type": integrators.DEFAULT_INTEGRATOR}))
+    integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, config.integrator))
+    kept = {key: value for key, value in config.integrator.items() if key in integrator_specs.PATH_OPTIONS}
+    spec = integrator_specs.integrator_spec(scene, kept | {"type": integrator_specs.DEFAULT_INTEGRATOR})
+    path = integrator_specs.build(spec)
     targets: dict[int, Any] = {}
     for target in config.targets:
         source = scene
@@ -218,5 +220,5 @@ def problem_of(config: Config) -> Problem:
 
 def with_integrator(config: Config, plugin: str) -> Config:
     """The same with another integrator, which keeps the path lengths of the first."""
-    kept = {key: config.integrator[key] for key in integrators.PATH_OPTIONS if key in config.integrator}
+    kept = {key: config.integrator[key] for key in integrator_specs.PATH_OPTIONS if key in config.integrator}
     return replace(config, integrator={"type": plugin, **kept})

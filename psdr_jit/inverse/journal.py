@@ -18,13 +18,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit import images
-from psdr_jit.compat import VERTEX_POSITIONS
+from psdr_jit.core.compat import VERTEX_POSITIONS
+from psdr_jit.derivative import images
 from psdr_jit.errors import CheckpointError, OptionError
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
 from psdr_jit.inverse.variables import numbers
-from psdr_jit.params import is_transform
+from psdr_jit.scene.params import is_transform
 
 #: Views that the final strip shows, and samples per pixel of its images.
 SHOWN, STRIP_SPP = 3, 64

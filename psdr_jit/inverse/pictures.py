@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psdr_jit.images import COLOUR_MAP, grey, robust_limit, save_figure, srgb
+from psdr_jit.derivative.images import COLOUR_MAP, grey, robust_limit, save_figure, srgb
 
 WIDTH = 2.6  # of a panel [inches]
 

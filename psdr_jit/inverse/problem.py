@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit import integrators
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
 from psdr_jit.inverse.variables import Variable
-from psdr_jit.params import is_transform, parameter_value
+from psdr_jit.scene.params import is_transform, parameter_value
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
 
@@ -170,7 +170,7 @@ def make_problem(
                     f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
                 )
     if not hasattr(integrator, "render_backward"):
-        integrator = integrators.build(integrators.integrator_spec(scene, integrator))
+        integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, integrator))
     by_name = {v.parameter: v for v in chosen}
     loss = find_loss(loss)
     digest = _fingerprint(params, by_name, found, loss, integrator, settings)

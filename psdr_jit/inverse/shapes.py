@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.compat import VERTEX_POSITIONS
+from psdr_jit.core.compat import VERTEX_POSITIONS
+from psdr_jit.core.upload import uploaded
 from psdr_jit.errors import OptionError, ParameterError, SetupError
 from psdr_jit.inverse.variables import AXES, copy_of, like, numbers, rms
-from psdr_jit.params import find_param
-from psdr_jit.upload import uploaded
+from psdr_jit.scene.params import find_param
 
 #: Distance in the cross-section, relative to its extent, below which vertices belong to the same point of it.
 SAME_POINT = 1e-4

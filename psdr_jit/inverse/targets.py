@@ -12,11 +12,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit import images
+from psdr_jit.core.film import black
+from psdr_jit.core.upload import uploaded
+from psdr_jit.derivative import images
 from psdr_jit.errors import OptionError, ParameterError
-from psdr_jit.film import black
-from psdr_jit.scene_io import find_sensor
-from psdr_jit.upload import uploaded
+from psdr_jit.scene.io import find_sensor
 
 #: Seed of rendered targets.
 TARGET_SEED = 0x7A26E7

@@ -14,10 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.compat import pack_positions
+from psdr_jit.core.compat import pack_positions
+from psdr_jit.core.upload import uploaded
 from psdr_jit.errors import OptionError, ParameterError
-from psdr_jit.params import find_param, is_transform
-from psdr_jit.upload import uploaded
+from psdr_jit.scene.params import find_param, is_transform
 
 AXES = "xyz"
 

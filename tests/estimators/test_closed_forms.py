@@ -8,7 +8,7 @@ import pytest
 from helpers import assert_grad_close, forward, load, spec_of
 from problems import Problem
 
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative.perturbation import perturb
 
 RADIANCE = np.array([1.0, 0.8, 0.6])  # of the glowing things in these scenes
 SKY = np.array([0.25, 0.5, 0.75])  # behind half_plane.xml

@@ -11,11 +11,11 @@ from helpers import POWER, forward, load
 from problems import Problem, X
 
 from benchmarks.baselines import edge_sampling
-from psdr_jit.boundary.edges import distribution_of
+from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.statistics import gain
+from psdr_jit.edges.table import distribution_of
 from psdr_jit.errors import UnsupportedError
-from psdr_jit.gradient import DerivativeSampler
-from psdr_jit.perturbation import Perturbation, perturb
-from psdr_jit.statistics import gain
 
 BLOCKER = "blocker.vertex_positions"
 SPP = 512

@@ -6,7 +6,7 @@ import pytest
 from helpers import TERMS, adjoint_identity, load, spec_of
 from problems import Problem
 
-from psdr_jit import integrators
+from psdr_jit.derivative import integrator_specs
 
 TOLERANCE = 1e-5
 SIZE = {"res": 16}
@@ -38,7 +38,7 @@ def check(case: str, term: str | None, known: bool | None, **options) -> None:
     """`known`: must this derivative be non-zero (True), zero (False), or may it be either (None)?"""
     scene_name, param, _ = CASES[case]
     scene = load(Problem(scene_name, param, 0.0), **{**SIZE, **options.pop("load", {})})
-    integrator = integrators.build(spec_of(scene, term, **options))
+    integrator = integrator_specs.build(spec_of(scene, term, **options))
     wJv, JTwv, w, Jv = adjoint_identity(scene, param, integrator)
     assert known is None or (Jv > 1e-6) == known
     if Jv == 0:
@@ -76,7 +76,7 @@ def test_the_identity_can_fail(llvm):
     """Different seeds are different matrices: the bound tells them apart."""
     scene_name, param, _ = CASES["mesh"]
     scene = load(Problem(scene_name, param, 0.0), **SIZE)
-    integrator = integrators.build(spec_of(scene))
+    integrator = integrator_specs.build(spec_of(scene))
     wJv, _, w, Jv = adjoint_identity(scene, param, integrator, seed=1)
     _, JTwv, _, _ = adjoint_identity(scene, param, integrator, seed=2)
     assert abs(wJv - JTwv) > 10 * TOLERANCE * w * Jv

@@ -11,9 +11,9 @@ import pytest
 from helpers import assert_grad_close, fd, forward
 
 from benchmarks import cases, meshes, stability
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.statistics import gain
 from psdr_jit.errors import UnsupportedWarning
-from psdr_jit.perturbation import perturb
-from psdr_jit.statistics import gain
 
 X = (1, 0, 0)
 SEEDS = 8
@@ -127,7 +127,7 @@ def test_a_light_that_the_centre_of_a_ball_does_not_face(llvm):
 
 def test_a_camera_that_leaves_a_room(llvm):
     """Seen from inside first, the same integrator must still know the box as closed from outside, and the reverse."""
-    from psdr_jit import integrators
+    from psdr_jit.derivative import integrator_specs
 
     box = {"room": {"type": "cube", "to_world": T().scale(0.5), "bsdf": white(True)}}
     lamp = {"type": "point", "position": [0.1, 0.2, -0.1], "intensity": 1.0}
@@ -135,7 +135,7 @@ def test_a_camera_that_leaves_a_room(llvm):
     sun = {"type": "constant"}
     built = scene(inside=inside, outside=outside, lamp=lamp, sun=sun, **box)
     motion = perturb(built, "room.vertex_positions", (1, 0, 0))
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 3})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3})
 
     def image(number: int) -> np.ndarray:
         motion.attach()
@@ -179,11 +179,12 @@ def test_fine_creases_are_sampled_by_what_they_show(llvm):
 
 def test_the_outline_of_a_sphere_has_no_fireflies(llvm):
     """Where a ray just touches a sphere, rounding makes the cosine 0 and the derivative anything at all."""
-    from psdr_jit import integrators, scene_io
+    from psdr_jit.derivative import integrator_specs
+    from psdr_jit.scene import io as scene_io
 
     scene = scene_io.load_scene(scene_io.shipped_scene("envmap_rotation.xml"), res=64)
     motion = perturb(scene, "ball.to_world", X)
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 2, "sppp": 0, "sppi": 0})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppp": 0, "sppi": 0})
     largest = []
     for seed in range(64, 80):
         motion.attach()

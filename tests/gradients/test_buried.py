@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import psdr_jit
-from psdr_jit import integrators, scene_io
-from psdr_jit.analytic_edges import curve_set
-from psdr_jit.boundary import buried, edges
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.edges import buried, table
+from psdr_jit.edges.curves import curve_set
+from psdr_jit.scene import io as scene_io
 
 BODIES = {
     "block": '<shape type="cube" id="floor"><transform name="to_world"><scale x="2" y="0.5" z="2"/>'
@@ -60,14 +61,14 @@ def test_edges_that_may_be_reached_are_kept(llvm):
 @pytest.mark.parametrize("body", BODIES)
 def test_what_is_left_out_is_zero(llvm, monkeypatch, body, form):
     """With the buried edges alone, whichever body moves, the boundary terms vanish exactly."""
-    monkeypatch.setattr(edges, "buried", lambda *args: ~buried.buried(*args))
-    monkeypatch.setattr(edges, "curve_set", lambda shapes: curve_set([]))
+    monkeypatch.setattr(table, "buried", lambda *args: ~buried.buried(*args))
+    monkeypatch.setattr(table, "curve_set", lambda shapes: curve_set([]))
     scene = scene_with(body)
     names = [BOX, "floor.vertex_positions" if body == "block" else "floor.to_world"]
     for name in names:
         motion = perturb(scene, name, (1, 0.3, 0))
         motion.attach()
-        integrator = integrators.build({"type": "psdr_path", "max_depth": 4, "form": form, **BUDGETS})
+        integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, "form": form, **BUDGETS})
         image = np.array(integrator.render_forward(scene, motion.params))
         motion.restore()
         assert len(integrator.plan.running) == 3 and np.abs(image).max() == 0
@@ -78,6 +79,6 @@ def test_the_others_are_not(llvm, monkeypatch):
     scene = scene_with("block")
     motion = perturb(scene, BOX, (1, 0.3, 0))
     motion.attach()
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 4, **BUDGETS})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, **BUDGETS})
     assert np.abs(np.array(integrator.render_forward(scene, motion.params))).max() > 0.01
     motion.restore()

@@ -9,7 +9,7 @@ import pytest
 from helpers import load, motion_of, spec_of
 from problems import PROBLEMS, Problem
 
-from psdr_jit import integrators
+from psdr_jit.derivative import integrator_specs
 
 SIZE, SPP = 16, 4
 QUICK = ("area_shadow", "environment_shadow", "sunk_ball", "cbox", "glossy_floor", "rough_dielectric")
@@ -18,7 +18,7 @@ QUICK = ("area_shadow", "environment_shadow", "sunk_ball", "cbox", "glossy_floor
 def check(problem: Problem, seeds: int) -> None:
     scene = load(problem, **({} if problem.scene == "camera_crop" else {"res": SIZE}))  # its window has a fixed size
     motion = motion_of(problem, scene)
-    integrator = integrators.build(spec_of(scene, **problem.options))
+    integrator = integrator_specs.build(spec_of(scene, **problem.options))
     film = scene.sensors()[0].film()
     channels = 4 if "rgba" in problem.load.values() else 3
     grad_in = dr.ones(mi.TensorXf, (*reversed(film.crop_size()), channels))
@@ -34,7 +34,7 @@ def check(problem: Problem, seeds: int) -> None:
         integrator.render_backward(scene, motion.params, grad_in, seed=seed, spp=SPP)
         assert np.isfinite(float(dr.grad(θ)[0]))
     motion.restore()
-    assert integrators.rejected(integrator) == 0
+    assert integrator_specs.rejected(integrator) == 0
 
 
 def once(problems) -> list[Problem]:

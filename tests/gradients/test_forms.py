@@ -8,7 +8,7 @@ from helpers import adjoint_identity, assert_grad_close, fd, forward, load, moti
 from problems import PROBLEMS, Problem
 from test_adjoint import CASES, SIZE, TOLERANCE
 
-from psdr_jit import integrators
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.options import FORMS
 
 QUICK = ("cbox", "environment_shadow", "sunk_ball", "sunk_box")  # light that is scattered twice; curves of contact
@@ -52,7 +52,7 @@ SLOW = ("floor-around-ball", "camera-pose")  # many kernels to compile on a fres
 def test_forward_and_backward_agree(variant, case):
     scene_name, param, _ = CASES[case]
     scene = load(Problem(scene_name, param, 0.0), **SIZE)
-    integrator = integrators.build(spec_of(scene, form="material", max_depth=4))
+    integrator = integrator_specs.build(spec_of(scene, form="material", max_depth=4))
     wJv, JTwv, w, Jv = adjoint_identity(scene, param, integrator)
     assert Jv > 1e-6
     assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"

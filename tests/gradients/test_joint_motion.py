@@ -9,8 +9,8 @@ import pytest
 from helpers import load, spec_of
 from problems import Problem
 
-from psdr_jit import integrators
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
 
 SEEDS, SPP, SIZE, BLOCK = 32, 32, 32, 4
 BOUND = 5.0  # standard errors
@@ -30,7 +30,7 @@ def derivative(case: str, moving: slice, direction) -> np.ndarray:
     scene_name, names = CASES[case]
     scene = load(Problem(scene_name, names[0], 0.0), res=SIZE, max_depth=3)
     motions = [perturb(scene, name, direction) for name in names[moving]]
-    integrator = integrators.build(spec_of(scene))
+    integrator = integrator_specs.build(spec_of(scene))
     images = []
     for seed in range(SEEDS):
         θ = mi.Float(0)

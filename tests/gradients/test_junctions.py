@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import assert_grad_close, fd, forward
 
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative.perturbation import perturb
 
 SEEDS, SPP, REFERENCE_SPP, EPS = 16, 64, 1024, 0.004
 
@@ -44,7 +44,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_against_finite_differences(llvm, monkeypatch, case):
-    from psdr_jit import edge_set
+    from psdr_jit.edges import segments
 
     kind, param, direction, rotate = CASES[case]
     scene = sunk(kind, 0.6, 7.0)
@@ -57,14 +57,14 @@ def test_against_finite_differences(llvm, monkeypatch, case):
     reference = fd(motion, spec, EPS, 2 * SEEDS, REFERENCE_SPP)
     assert_grad_close(estimate, reference, 0.02)
 
-    monkeypatch.setattr(edge_set, "find_junctions", lambda solids, balls, cache: None)
+    monkeypatch.setattr(segments, "find_junctions", lambda solids, balls, cache: None)
     with pytest.raises(AssertionError):  # without the curves the comparison fails
         assert_grad_close(forward(motion, spec, SEEDS, SPP), reference, 0.02)
 
 
 def test_they_are_updated_with_the_shapes(llvm):
     """A box that is lifted out of the floor and put back: the curve goes and comes, and rests are remembered."""
-    from psdr_jit.edge_set import edge_set
+    from psdr_jit.edges.segments import edge_set
 
     scene = sunk("cube", 0.6, 0.0)
     params = mi.traverse(scene)

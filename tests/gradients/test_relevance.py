@@ -9,7 +9,7 @@ import pytest
 from helpers import forward, load, motion_of, spec_of
 from problems import named
 
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative.perturbation import perturb
 
 CASES = [
     ("area_shadow", "blocker.vertex_positions"),
@@ -47,7 +47,8 @@ def test_pruned_edges_of_a_distant_light(llvm, monkeypatch):
 
 
 def require_nothing_dropped(monkeypatch, motion, spec):
-    from psdr_jit.boundary import direct, relevance
+    from psdr_jit.boundary import direct
+    from psdr_jit.sampling import relevance
 
     dropped = []
 

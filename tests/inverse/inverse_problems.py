@@ -7,10 +7,12 @@ from typing import Any
 
 import mitsuba as mi
 
-from psdr_jit import Parameter, Pose, integrators, scene_io
+from psdr_jit import Parameter, Pose
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.inverse.problem import Problem, make_problem
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import rendered
+from psdr_jit.scene import io as scene_io
 
 BOX, LAMP = "blocker.vertex_positions", "lamp.position"
 CONFIG = """
@@ -58,7 +60,7 @@ def box_and_lamp() -> list[Any]:
 
 def problem_of(variables: Any = None, loss: Any = "l2", targets: Any = None, **settings: Any) -> Problem:
     scene = scene_of()
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 2})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2})
     targets = target_of(scene) if targets is None else targets
     return make_problem(
         scene, variables or box_and_lamp(), targets, loss, integrator, Settings(**{"spp": 4, **settings})

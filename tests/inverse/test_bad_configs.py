@@ -7,8 +7,9 @@ import pytest
 from inverse_problems import BOX, box_and_lamp, problem_of, scene_of, target_of, write_config
 
 import psdr_jit
-from psdr_jit import Parameter, Pose, images
+from psdr_jit import Parameter, Pose
 from psdr_jit.cli import main
+from psdr_jit.derivative import images
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse import config
 

@@ -13,11 +13,13 @@ from batch_views import batch_of
 from inverse_problems import BOX, LAMP, box_and_lamp, problem_of, scene_of, target_of
 
 import psdr_jit
-from psdr_jit import Parameter, Pose, integrators, scene_io
+from psdr_jit import Parameter, Pose
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, ParameterError, StalledWarning
 from psdr_jit.inverse import loop
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.settings import Settings
+from psdr_jit.scene import io as scene_io
 
 
 def gradient_of(problem, iteration=0):
@@ -91,7 +93,7 @@ def two_views(**settings):
     second = text[start:end].replace('id="camera"', 'id="other"').replace("0.7, 2.2, 4", "-2.5, 2.2, 2")
     scene = mi.load_string(text[:end] + second + text[end:], res=16, max_depth=2, optimize=False)
     targets = [target_of(scene, sensor) for sensor in (0, 1)]
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 2, "sppc": 4, "sppp": 4, "sppi": 4})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppc": 4, "sppp": 4, "sppi": 4})
     variables = [Pose(BOX, 0.02, start_shift=(0.2, 0, -0.1)), Pose(LAMP, 0.02)]
     return make_problem(scene, variables, targets, "l2", integrator, Settings(spp=4, **settings))
 
@@ -101,7 +103,7 @@ def test_gradients_of_views_add_up(llvm, plugin):
     """One backward pass per view, one update: Mitsuba issues 1587 and 1877 are about losing all but one of them."""
     both = two_views()
     if plugin != "psdr_path":
-        both = replace(both, integrator=integrators.build({"type": plugin, "max_depth": 2, "guiding": "none"}))
+        both = replace(both, integrator=integrator_specs.build({"type": plugin, "max_depth": 2, "guiding": "none"}))
     alone = [gradient_of(OnlyView(both, k)) for k in (0, 1)]
     loss, together = gradient_of(both)
     assert loss == pytest.approx(np.mean([a[0] for a in alone]), rel=1e-4)

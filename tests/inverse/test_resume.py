@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from inverse_problems import BOX, problem_of, write_config
 
-from psdr_jit import Pose, Vertices, images
+from psdr_jit import Pose, Vertices
+from psdr_jit.derivative import images
 from psdr_jit.errors import CheckpointError, OptionError
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import loop

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from inverse_problems import BOX, scene_of
 
-from psdr_jit import Parameter, Pose, Profile, Vertices, scene_io
+from psdr_jit import Parameter, Pose, Profile, Vertices
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.variables import like, numbers, rigid
+from psdr_jit.scene import io as scene_io
 
 
 def begin(variable, scene):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import psdr_jit
-from psdr_jit import scene_checks
 from psdr_jit.cli.main import main
+from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import (
     OptionError,
     ParameterError,
@@ -23,8 +23,8 @@ from psdr_jit.errors import (
     ZeroDerivativeWarning,
 )
 from psdr_jit.options import Options
-from psdr_jit.scene_analysis import analyse
-from psdr_jit.terms import TERMS
+from psdr_jit.scene import checks
+from psdr_jit.scene.facts import analyse
 
 BOX = "box.vertex_positions"
 FLOOR = "floor.bsdf.reflectance.value"
@@ -309,7 +309,7 @@ def test_parameters_of_delta_lobes_are_not_silently_zero(bsdf, parameter):
     scene = load(box={"type": "cube", "bsdf": bsdf})
     enabled(scene, f"box.bsdf.{parameter}")
     with pytest.raises(UnsupportedError, match="use a rough BSDF") as caught:
-        scene_checks.require_supported(analyse(scene))
+        checks.require_supported(analyse(scene))
     assert "blend" in bsdf["type"] or parameter in str(caught.value)
 
 
@@ -323,14 +323,14 @@ def test_parameters_of_delta_lobes_are_not_silently_zero(bsdf, parameter):
 def test_parameters_beside_delta_lobes_are_fine(bsdf, parameter):
     scene = load(box={"type": "cube", "bsdf": bsdf})
     enabled(scene, f"box.bsdf.{parameter}")
-    scene_checks.require_supported(analyse(scene))
+    checks.require_supported(analyse(scene))
 
 
 def test_normals_of_a_mirror_steer_its_reflection():
     scene = load(box={"type": "cube", "bsdf": {"type": "conductor"}})
     enabled(scene, "box.vertex_normals")
     with pytest.raises(UnsupportedError, match=r"box\.vertex_normals"):
-        scene_checks.require_supported(analyse(scene))
+        checks.require_supported(analyse(scene))
 
 
 # Warnings
@@ -341,7 +341,7 @@ def missing_terms(facts, terms, depth):
         warnings.simplefilter("always")
         said = {}
         for _ in range(2):
-            scene_checks.warn_about_missing_terms(facts, terms, depth, said)
+            checks.warn_about_missing_terms(facts, terms, depth, said)
     return [str(w.message) for w in caught]
 
 
@@ -363,7 +363,7 @@ def test_missing_boundary_terms_are_said_once():
 
 
 def test_the_integrator_warns_by_its_table_of_terms():
-    missing = [name for name in scene_checks.BOUNDARY_TERMS if name not in [t.name for t in TERMS]]
+    missing = [name for name in checks.BOUNDARY_TERMS if name not in [t.name for t in TERMS]]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         forward(load(), options={"max_depth": 4})

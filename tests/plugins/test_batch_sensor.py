@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from batch_views import ORIGINS, RES, VIEWS, batch_of
 
-from psdr_jit import integrators
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
 
 
 def film(width: int) -> dict:
@@ -17,7 +17,7 @@ def film(width: int) -> dict:
 
 
 def psdr(**options) -> mi.Integrator:
-    return integrators.build({"type": "psdr_path", "max_depth": 2, "sppc": 16, "sppp": 16, "sppi": 16, **options})
+    return integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppc": 16, "sppp": 16, "sppi": 16, **options})
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import accuracy, cases, methods, report, rows, run, stability
 from benchmarks.suites import REFERENCE
-from psdr_jit import scene_io
+from psdr_jit.scene import io as scene_io
 
 
 def chosen(*words: str) -> list[run.Task]:

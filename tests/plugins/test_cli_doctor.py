@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from psdr_jit import drjit_libraries, llvm, llvm_fetch
 from psdr_jit.cli import doctor, main
 from psdr_jit.cli import test as test_command
 from psdr_jit.errors import ParameterError, SetupError
+from psdr_jit.setup import drjit_libraries, llvm, llvm_fetch
 
 ROOT = Path(__file__).resolve().parents[2]
 

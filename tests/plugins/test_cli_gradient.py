@@ -7,8 +7,9 @@ import os
 import numpy as np
 import pytest
 
-from psdr_jit import finite_differences, images, scene_io
 from psdr_jit.cli.main import main
+from psdr_jit.derivative import finite_differences, images
+from psdr_jit.scene import io as scene_io
 
 CARD = str(scene_io.shipped_scene("emissive_card.xml"))
 CBOX = str(scene_io.shipped_scene("cbox.xml"))
@@ -52,7 +53,7 @@ def test_gradient_writes_layers_and_png(capsys):
 
 
 def term_names() -> list[str]:
-    from psdr_jit.integrators import term_table
+    from psdr_jit.derivative.integrator_specs import term_table
 
     return [name for name, _ in term_table("psdr_path")]
 
@@ -156,15 +157,15 @@ def test_scalar_variant_has_no_derivatives(capsys):
 
 def test_scene_options_reach_the_integrator():
     """psdr_path takes over the scene's path lengths; --max-depth wins; the reference has the same ones."""
-    from psdr_jit import integrators
+    from psdr_jit.derivative import integrator_specs
 
     scene_io.use_variant("llvm_ad_rgb")
     scene = scene_io.load_scene(CBOX, max_depth=3, rr_depth=77)
-    spec = integrators.integrator_spec(scene)
+    spec = integrator_specs.integrator_spec(scene)
     assert spec == {"type": "psdr_path", "max_depth": 3, "rr_depth": 77, "hide_emitters": False}
-    assert integrators.integrator_spec(scene, max_depth=5)["max_depth"] == 5
-    assert integrators.path_options(integrators.build(spec))["rr_depth"] == 77
-    assert integrators.path_options(integrators.reference({**spec, "max_depth": -1}))["max_depth"] == -1
+    assert integrator_specs.integrator_spec(scene, max_depth=5)["max_depth"] == 5
+    assert integrator_specs.path_options(integrator_specs.build(spec))["rr_depth"] == 77
+    assert integrator_specs.path_options(integrator_specs.reference({**spec, "max_depth": -1}))["max_depth"] == -1
     own = scene_io.integrator_properties(CBOX, max_depth=3)
     assert own == {"type": "path", "max_depth": 3, "rr_depth": 5}
 

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit import integrators, scene_io
-from psdr_jit.perturbation import perturb
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.scene import io as scene_io
 
 WARM_UP, CALLS = 4, 12
 
@@ -18,7 +19,7 @@ WARM_UP, CALLS = 4, 12
 def test_later_calls_compile_nothing(llvm, mode, form):
     scene = scene_io.load_scene(scene_io.shipped_scene("baffled_light.xml"), res=16)
     motion = perturb(scene, "blocker.vertex_positions", (1, 0, 0))
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 3, "form": form, "sppc": 4})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": form, "sppc": 4})
     compiled, known = [], set()  # by hash: kernels that an earlier process has left on disk count as compiled here
     for seed in range(CALLS):
         spp = 4 + seed % 3  # budgets change as they follow the noise

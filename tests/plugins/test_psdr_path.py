@@ -13,8 +13,9 @@ from conftest import activate
 from helpers import adjoint_identity, load, motion_of, spec_of
 from problems import Problem, named
 
-from psdr_jit import integrators, scene_io
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, UnsupportedError, ZeroDerivativeWarning
+from psdr_jit.scene import io as scene_io
 
 SIZE = {"res": 16}
 BOX = Problem("lit_box", "box.vertex_positions", 0.0, direction=(1, 0, 0))
@@ -78,7 +79,7 @@ def derivative(scene, integrator, seed=0, spp=4, problem=BOX) -> np.ndarray:
 def test_a_budget_of_zero_switches_a_term_off(variant):
     scene = load(BOX, **SIZE)
     full, interior, primary = (
-        derivative(scene, integrators.build({"type": "psdr_path", "max_depth": 2, **off}))
+        derivative(scene, integrator_specs.build({"type": "psdr_path", "max_depth": 2, **off}))
         for off in ({"sppc": 1}, {"sppp": 0}, {"sppc": 0})  # any budget that is set ends automatic ones
     )
     assert np.abs(interior).max() > 0 and np.abs(primary).max() > 0
@@ -89,7 +90,7 @@ def test_all_terms_off_is_an_error(llvm):
     scene = load(BOX, **SIZE)
     off = {"type": "psdr_path", "sppc": 0, "sppp": 0, "sppd": 0, "sppi": 0}
     with pytest.raises(OptionError, match="switched off"):
-        derivative(scene, integrators.build(off))
+        derivative(scene, integrator_specs.build(off))
 
 
 def test_depth_zero_is_black(llvm):
@@ -124,7 +125,7 @@ def test_seeds_are_independent_when_split_into_passes(llvm):
     scene = load(Problem("point_light", "floor.bsdf.reflectance.value", 0.0), res=64, max_depth=4)
     scene_param = Problem("point_light", "floor.bsdf.reflectance.value", 0.0)
     integrator = mi.load_dict({"type": "psdr_path", "max_depth": 4, "record_mib": 16, "sppp": 0})
-    from psdr_jit.path_records import PathRecords
+    from psdr_jit.paths.recording import PathRecords
 
     per_pass = 16 * 2**20 // (PathRecords.BYTES_RGB * 4 * 64 * 64)
     images = [derivative(scene, integrator, k * per_pass, 2 * per_pass, scene_param).ravel() for k in range(8)]
@@ -145,7 +146,7 @@ def test_render_and_backward(variant, case):
     """`mi.render` with gradients: forward and backward agree, and with the plugin's own images."""
     problem = BOX if case == "mesh" else named("camera_perspective", "camera.to_world")
     scene = load(problem, **SIZE)
-    integrator = integrators.build(spec_of(scene))
+    integrator = integrator_specs.build(spec_of(scene))
     params = mi.traverse(scene)
     w = np.random.default_rng(0).normal(size=(16, 16, 3)).astype(np.float32)
 
@@ -182,7 +183,7 @@ def test_other_colours(name):
     for v in ("llvm_ad_rgb", name):
         activate(v)
         scene = load(named("rectangle_moved", "plate.to_world"), **SIZE)
-        integrator = integrators.build(spec_of(scene))
+        integrator = integrator_specs.build(spec_of(scene))
         wJv, JTwv, w, Jv = adjoint_identity(scene, "plate.to_world", integrator)
         assert abs(wJv - JTwv) < 1e-5 * w * Jv
         problem = named("rectangle_moved", "plate.to_world")
@@ -229,6 +230,6 @@ def test_awkward_places(variant, where):
     params.update()
     image = derivative(scene, mi.load_dict({"type": "psdr_path", "max_depth": 2}))
     assert np.isfinite(image).all()
-    integrator = integrators.build(spec_of(scene))
+    integrator = integrator_specs.build(spec_of(scene))
     wJv, JTwv, w, Jv = adjoint_identity(scene, BOX.param, integrator)
     assert abs(wJv - JTwv) <= 1e-5 * w * Jv + 1e-12

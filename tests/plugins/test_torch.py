@@ -9,7 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit import integrators, scene_io
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.scene import io as scene_io
 
 torch = pytest.importorskip("torch")
 
@@ -17,7 +18,7 @@ torch = pytest.importorskip("torch")
 def renderer():
     """A function of Dr.Jit tensors: intensity (3) of a lamp, and how far (3) it is moved."""
     scene = scene_io.load_scene(scene_io.shipped_scene("point_shadow.xml"), res=16)
-    integrator = integrators.build({"type": "psdr_path", "max_depth": 2, "sppc": 16, "sppp": 16, "sppi": 16})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppc": 16, "sppp": 16, "sppi": 16})
     params = mi.traverse(scene)
     position = mi.Point3f(params["lamp.position"])
 

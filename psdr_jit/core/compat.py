@@ -1,0 +1,76 @@
+"""Every Mitsuba name that differs between versions, and nothing else.
+
+Mitsuba 3.10 renames the mesh parameters and stores them as (N, 3) tensors. It is unreleased: the names here
+follow its announcement, and only 3.9 has been run.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UnsupportedError
+
+INDEXED_MESHES = tuple(int(part) for part in mi.__version__.split(".")[:2]) >= (3, 10)
+"""Meshes of this Mitsuba are tensors that may be indexed separately from the vertices."""
+
+VERTEX_POSITIONS = "positions" if INDEXED_MESHES else "vertex_positions"
+VERTEX_NORMALS = "normals" if INDEXED_MESHES else "vertex_normals"
+VERTEX_TEXCOORDS = "texcoords" if INDEXED_MESHES else "vertex_texcoords"
+FACES = "faces"
+
+
+def mesh_positions(mesh: mi.Mesh) -> mi.Point3f:
+    """Vertex positions (V), world space, attached if the mesh is."""
+    if not INDEXED_MESHES:
+        # not the traversed parameter: a `rectangle` has this buffer but exposes its pose only
+        # and not `dr.unravel`, whose adjoint in Dr.Jit 1.5 overwrites the buffer's gradient instead of adding to it
+        return dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), dr.arange(mi.UInt32, mesh.vertex_count()))
+    return mi.Point3f(_parameter(mesh, VERTEX_POSITIONS), flip_axes=True)
+
+
+def positions_buffer(mesh: mi.Mesh) -> mi.Float:
+    """The array that holds the vertex positions, replaced whenever they change; attached if the mesh is."""
+    return _parameter(mesh, VERTEX_POSITIONS).array if INDEXED_MESHES else mesh.vertex_positions_buffer()
+
+
+def mesh_buffers(mesh: mi.Mesh) -> tuple:
+    """All arrays on which edges depend; each is replaced by another when it changes."""
+    if INDEXED_MESHES:
+        params = mi.traverse(mesh)
+        keys = (VERTEX_POSITIONS, VERTEX_NORMALS, VERTEX_TEXCOORDS, FACES)
+        return tuple(params[key].array for key in keys if key in params)
+    return (mesh.vertex_positions_buffer(), mesh.vertex_normals_buffer(), mesh.vertex_texcoords_buffer(),
+            mesh.faces_buffer())  # fmt: skip
+
+
+def mesh_faces(mesh: mi.Mesh) -> mi.Vector3u:
+    """Corner indices (F) into `mesh_positions`."""
+    if not INDEXED_MESHES:
+        return dr.unravel(mi.Vector3u, mesh.faces_buffer())
+    return mi.Vector3u(_parameter(mesh, FACES), flip_axes=True)
+
+
+def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
+    """The array that holds the corner indices, replaced whenever they change."""
+    return _parameter(mesh, FACES).array if INDEXED_MESHES else mesh.faces_buffer()
+
+
+def same_faces(a: mi.UInt32, b: mi.UInt32) -> bool:
+    """Do two arrays of corner indices agree? At once if they are one array."""
+    return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
+
+
+def pack_positions(points: mi.Point3f) -> mi.Float | mi.TensorXf:
+    """`points` in the form in which the parameter `VERTEX_POSITIONS` is assigned."""
+    return mi.TensorXf(points, flip_axes=True) if INDEXED_MESHES else dr.ravel(points)
+
+
+def _parameter(mesh: mi.Mesh, key: str):
+    params = mi.traverse(mesh)
+    if "position_index" in params and dr.width(params["position_index"]) > 0:
+        raise UnsupportedError(
+            f"mesh '{mesh.id()}' indexes its positions separately from its vertices; "
+            "export it with one position per vertex"
+        )
+    return params[key]

@@ -1,0 +1,123 @@
+"""From samples to images and back: the only file that talks to films and image blocks."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UnsupportedError
+from .ad import backpropagate
+
+#: Quadrature nodes per pixel for the integral of a reconstruction filter.
+FILTER_NODES = 256
+
+
+def require_film(film: mi.Film) -> None:
+    """Films that re-weight samples themselves (`specfilm`) have no boundary splat here."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise UnsupportedError(f"film '{film.class_name()}' converts samples itself; use an `hdrfilm`")
+
+
+def clear(film: mi.Film) -> None:
+    film.prepare([])
+
+
+def _put(block: mi.ImageBlock, film: mi.Film, pos, value, alpha, weight, wavelengths, active) -> None:
+    if mi.is_spectral:
+        rgb = mi.spectrum_to_srgb(value, wavelengths)
+    elif mi.is_monochromatic:
+        rgb = mi.Color3f(value.x)
+    else:
+        rgb = value
+    channels = [rgb.x, rgb.y, rgb.z]
+    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+        channels.append(alpha)
+    block.put(pos, channels + [weight], active)
+
+
+def develop_samples(
+    film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool
+) -> mi.TensorXf:
+    """Weighted mean of per-sample values as Mitsuba's renderers form it; attached where `value` is.
+
+    `pos`: film positions [px]. Alpha is constant along this term, so its derivative is written as 0.
+    """
+    clear(film)
+    block = film.create_block()
+    block.set_coalesce(block.coalesce() and coalesce)
+    _put(block, film, pos, value, mi.Float(0), mi.Float(1), wavelengths, mi.Bool(True))
+    film.put_block(block)
+    return film.develop()
+
+
+def sample_adjoint(
+    film: mi.Film, pos: mi.Point2f, grad_in: mi.TensorXf, wavelengths, coalesce: bool
+) -> mi.Spectrum:
+    """Adjoint of `develop_samples`: derivative of ⟨grad_in, image⟩ with respect to each sample's value."""
+    with dr.resume_grad():
+        value = dr.zeros(mi.Spectrum, dr.width(pos))
+        dr.enable_grad(value)
+        backpropagate(develop_samples(film, pos, value, wavelengths, coalesce), grad_in)
+        adjoint = dr.grad(value)
+    clear(film)
+    return adjoint
+
+
+def sampled_window(film: mi.Film) -> tuple[np.ndarray, np.ndarray]:
+    """Film region that receives camera samples, `(lower, upper)` corners [px], as in `ADIntegrator.sample_rays`."""
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    lower = np.array(film.crop_offset(), dtype=float) - border
+    return lower, lower + np.array(film.crop_size(), dtype=float) + 2 * border
+
+
+def _filter_mass(
+    rfilter: mi.ReconstructionFilter, first: int, count: int, window: tuple[float, float]
+) -> np.ndarray:
+    """∫ f(x − x_i) dx over `window` for each of `count` pixel centres x_i along one axis (midpoint rule)."""
+    reach = int(np.ceil(rfilter.radius()))
+    nodes = (np.arange(2 * reach * FILTER_NODES) + 0.5) / FILTER_NODES - reach
+    f = np.array(rfilter.eval(mi.Float(nodes)))
+    x = first + 0.5 + np.arange(count)[:, None] + nodes[None, :]
+    return (f * ((x > window[0]) & (x < window[1]))).sum(axis=1) / FILTER_NODES
+
+
+#: What `_pixel_mass` has returned, by everything that it depends on.
+_MASSES: dict[tuple, mi.TensorXf] = {}
+
+
+def _pixel_mass(film: mi.Film) -> mi.TensorXf:
+    """∫ f over the sampled window around each pixel, (H, W, 1): the limit of Mitsuba's weight division."""
+    lower, upper = sampled_window(film)
+    offset, size = film.crop_offset(), film.crop_size()
+    key = (mi.variant(), str(film.rfilter()), *offset, *size, *lower, *upper)
+    if key not in _MASSES:
+        x, y = (_filter_mass(film.rfilter(), offset[a], size[a], (lower[a], upper[a])) for a in (0, 1))
+        _MASSES[key] = mi.TensorXf((y[:, None] * x[None, :])[:, :, None].astype(np.float32))
+    return _MASSES[key]
+
+
+def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> mi.TensorXf:
+    """Image of boundary contributions: Σ f(pos − pixel) · value, over the filter mass of the pixel.
+
+    The interior image converges to ∫ f L / ∫ f over the sampled window, so the boundary integral ∫ f ΔL v dl
+    needs the same denominator; dividing by the *discrete* sum of filter weights (a "normalised" splat) is another
+    estimator, and scaling by the border's area is wrong. Attached where `value` and `alpha` are.
+    """
+    lower, upper = sampled_window(film)
+    inside = (pos.x >= lower[0]) & (pos.x < upper[0]) & (pos.y >= lower[1]) & (pos.y < upper[1])
+    clear(film)
+    block = film.create_block()
+    block.set_coalesce(False)
+    _put(block, film, pos, value, alpha, mi.Float(0), wavelengths, active & inside)
+    film.put_block(block)
+    image = film.develop()
+    if film.rfilter().is_box_filter():
+        return image
+    return image / _pixel_mass(film)
+
+
+def black(film: mi.Film) -> mi.TensorXf:
+    """An image of zeros in the film's format."""
+    clear(film)
+    return film.develop() * 0

@@ -1,0 +1,252 @@
+"""Is a gradient right? A verdict against finite differences of the scene file's own parameter.
+
+Three numbers decide: the gain (least-squares slope against two independent halves of finite differences), the
+root mean square z-score of pixel blocks, and the largest |z|. A gradient of 0, -g or g/2 has gain 0, -1 or
+1/2 and fails; so does a right answer that is not known precisely enough: that is `inconclusive`, not a pass.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.finite_differences import CentralDifference, default_block
+from psdr_jit.derivative.gradient import DerivativeSampler, differentiable
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
+from psdr_jit.errors import OptionError
+from psdr_jit.options import require_count
+
+PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
+
+RMS_Z = (0.8, 1.2)      # errors that are honest give 1
+MAX_Z = 6.0
+SETTLED_SEEDS = 96   # from here on the scatter of block means is taken at face value
+SCATTER = "blocks scatter more than their errors"
+MIN_SEEDS = 32          # below, the measured standard errors are too noisy for z-scores
+REFINEMENTS = 2         # how often a failure is re-examined with a quarter of the step
+GROSS = 0.1             # a gain off by more than this is no artefact of the step
+SURE = 4.0              # standard errors beyond which more seeds would not change a failure
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The decision and the numbers behind it; what `judge` returns."""
+
+    verdict: str            # pass, fail or inconclusive
+    reason: str
+    gain: float
+    gain_stderr: float
+    rms_z: float
+    max_z: float
+    blocks: int
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """A verdict with its circumstances."""
+
+    verdict: Verdict
+    seeds: int              # of the estimator
+    reference_seeds: int    # of finite differences, both halves together
+    spp: int
+    reference_spp: int
+    eps: float
+    block: int              # [px]
+    seconds: float
+    terms: tuple[str, ...]
+    param: str
+    direction: str
+    estimate: np.ndarray    # mean derivative image, (H, W, C)
+    reference: np.ndarray
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict.verdict == PASS
+
+    def __str__(self) -> str:
+        v = self.verdict
+        return "\n".join((
+            f"check {self.param}, {self.direction}: {v.verdict.upper()} ({v.reason})",
+            f"  terms in the estimate: {', '.join(self.terms)}",
+            f"  gain {v.gain:.4f} +- {v.gain_stderr:.4f}   RMS z {v.rms_z:.3f}   max |z| {v.max_z:.2f}   "
+            f"({v.blocks} blocks of {self.block} px)",
+            f"  estimate {self.seeds} seeds x {self.spp} spp; finite differences {self.reference_seeds} "
+            f"seeds x 2 x {self.reference_spp} spp, eps {self.eps:.3g}; {self.seconds:.1f} s"))
+
+
+def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *, tolerance: float = 0.02,
+          max_stderr: float = 0.007, zero_bound: float | None = None,
+          floor: float | np.ndarray = 0.0) -> Verdict:
+    """Apply the pass rule to images collected so far; `inconclusive` when more seeds could still decide.
+
+    `zero_bound`: for a gradient that ought to vanish, the largest block mean [radiance per unit] accepted.
+    `floor`: error of block means that no scatter shows, see `block_test`.
+    """
+    slope = gain(d.group_means(), f1.group_means(), f2.group_means())
+    halves = np.concatenate((f1.group_means(), f2.group_means()))
+    test = block_test(d.group_means(), halves, block, floor)
+    decision, reason = _decide(slope, test, d, f1, f2, block, tolerance, max_stderr, zero_bound)
+    return Verdict(decision, reason, slope.value, slope.stderr, test.rms_z, test.max_z, test.blocks)
+
+
+def _decide(slope: Gain, test: BlockTest, d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int,
+            tolerance: float, max_stderr: float, zero_bound: float | None) -> tuple[str, str]:
+    if min(d.total, f1.total, f2.total) < MIN_SEEDS:
+        return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds"
+    if zero_bound is not None:
+        return _judge_zero(d, f1, f2, block, zero_bound)
+    if slope.power == 0 and not d.mean().any():
+        return PASS, "estimate and finite differences are both exactly zero"
+    if not slope.has_signal:
+        if test.max_z > MAX_Z:
+            return FAIL, ("finite differences vanish within their error, the estimate does not: "
+                          f"max |z| {test.max_z:.1f}")
+        return INCONCLUSIVE, ("finite differences cannot be told from zero; if the gradient ought to vanish, "
+                              "give an absolute bound (zero_bound)")
+    return _judge_gain(slope, test, min(d.total, f1.total, f2.total), tolerance, max_stderr)
+
+
+def _slightly_scattered(test: BlockTest) -> bool:
+    """Blocks are off by more than their errors, but not by so much that more seeds could not explain it."""
+    off = test.max_z > MAX_Z or (np.isfinite(test.rms_z) and not RMS_Z[0] <= test.rms_z <= RMS_Z[1])
+    return off and test.max_z <= 2 * MAX_Z and test.rms_z <= 2 * RMS_Z[1]
+
+
+def _judge_gain(slope: Gain, test: BlockTest, seeds: int, tolerance: float, max_stderr: float) -> tuple[str, str]:
+    off = abs(slope.value - 1)
+    precise = slope.stderr <= max_stderr
+    known = slope.stderr <= max_stderr / 2
+    if off > tolerance + (0 if known else SURE * slope.stderr):
+        return FAIL, f"gain is off by {off:.3f}, tolerance {tolerance:g}"
+    if precise and off > tolerance:
+        return INCONCLUSIVE, f"gain is off by {off:.3f} +- {slope.stderr:.4f}, not certain to exceed {tolerance:g}"
+    if seeds < SETTLED_SEEDS and _slightly_scattered(test):
+        # Standard errors of few, heavy-tailed samples are too small: a bias grows with more seeds, this fades.
+        return INCONCLUSIVE, f"{SCATTER} (RMS z {test.rms_z:.2f}, max |z| {test.max_z:.1f})"
+    if test.max_z > MAX_Z:
+        return FAIL, f"a block is off by {test.max_z:.1f} standard errors, limit {MAX_Z:g}"
+    if not precise:
+        return INCONCLUSIVE, f"standard error of the gain is {slope.stderr:.4f}, needs {max_stderr:g}"
+    if np.isfinite(test.rms_z) and not RMS_Z[0] <= test.rms_z <= RMS_Z[1]:
+        return FAIL, f"RMS z {test.rms_z:.2f} is outside {RMS_Z[0]} to {RMS_Z[1]}"
+    return PASS, f"gain within {tolerance:g}, errors as measured"
+
+
+def _judge_zero(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int,
+                bound: float) -> tuple[str, str]:
+    """Both images must be small in absolute terms, and known well enough to say so."""
+    outcome = PASS, f"every block mean is below {bound:g}"
+    for what, images in (("estimate", d), ("finite differences", f1), ("finite differences", f2)):
+        size, errors = np.abs(block_means(images.mean(), block)), images.stderr(block)
+        if np.any(size > bound + SURE * errors):
+            return FAIL, f"the {what} reach {size.max():.3g}, bound {bound:g}"
+        if np.any(size + SURE * errors > bound):
+            outcome = INCONCLUSIVE, f"the error of the {what} is {errors.max():.3g}, too large for {bound:g}"
+    return outcome
+
+
+def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
+                   index: int | None = None, integrator: Any = None, spp: int = 64, sensor: int = 0,
+                   eps: float | None = None, reference_spp: int | None = None, block: int | None = None,
+                   tolerance: float = 0.02, max_stderr: float = 0.007, max_seconds: float = 120.0,
+                   zero_bound: float | None = None,
+                   progress: Callable[[float, Verdict], None] | None = None) -> CheckResult:
+    """Compare forward-mode derivatives with central differences until the verdict is certain or time is up.
+
+    The reference is Mitsuba's `path` with the max_depth, rr_depth and hide_emitters of `integrator`. Seeds go
+    to whichever of the two lowers the error of the gain more per second. Only terms of the estimate that are
+    implemented are in it: where others matter, the check fails, and should.
+
+    `progress(seconds, verdict)` is called after every batch of seeds.
+    """
+    _require_sane(sensor, counts=dict(spp=spp, reference_spp=reference_spp, block=block),
+                  reals=dict(eps=eps, max_seconds=max_seconds, tolerance=tolerance, max_stderr=max_stderr,
+                             zero_bound=zero_bound))
+    if not isinstance(param, Perturbation):
+        param = perturb(scene, param, direction, rotate=rotate, index=index)
+    if hasattr(integrator, "render_forward"):
+        spec, tested = integrator_specs.path_options(integrator), integrator
+        terms: list[str] = []
+    else:
+        spec = integrator_specs.integrator_spec(scene, integrator)
+        tested, terms = differentiable(spec), integrator_specs.terms_of(spec)
+    start = time.perf_counter()
+    estimate = DerivativeSampler(param, tested, sensor, spp)
+    reference = CentralDifference(param, spec, sensor, reference_spp, eps)
+    rule = dict(tolerance=tolerance, max_stderr=max_stderr, zero_bound=zero_bound)
+    try:
+        verdict, block = _collect(estimate, reference, block, start, start + max_seconds, progress, rule)
+        # Differences across a kink (an edge that meets the corner of a pixel block) are biased by O(eps), not
+        # O(eps^2): a failure is believed only if it is gross, or if a smaller step does not cure it.
+        for _ in range(REFINEMENTS if eps is None else 0):
+            if verdict.verdict != FAIL or not abs(verdict.gain - 1) < GROSS:
+                break
+            finer = CentralDifference(param, spec, sensor, reference_spp, reference.eps / 4)
+            retry, block = _collect(estimate, finer, block, start, start + max_seconds, progress, rule)
+            if retry.verdict == INCONCLUSIVE:
+                break
+            verdict, reference = retry, finer
+    finally:
+        param.restore()
+    return CheckResult(verdict, estimate.seeds, 2 * reference.seeds, spp, reference.spp, reference.eps, block,
+                       time.perf_counter() - start, tuple(terms) or ("all of the given integrator",),
+                       param.name, param.label, estimate.images.mean(), reference.result(block).mean)
+
+
+def _require_sane(sensor: Any, counts: dict[str, Any], reals: dict[str, Any]) -> None:
+    """Raise `OptionError` for what is given (not None) and not a positive number."""
+    for name, value in counts.items():
+        if value is not None:
+            require_count(name, value)
+    for name, value in {**counts, **reals}.items():
+        if value is not None and not (isinstance(value, Real) and value > 0):
+            raise OptionError(f"{name} must be a positive number, got {value!r}")
+    if isinstance(sensor, mi.Sensor):
+        raise OptionError("sensor must be an index: the finite differences render the scene's own sensors")
+
+
+def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: int | None, start: float,
+             deadline: float, progress: Any, rule: dict[str, Any]) -> tuple[Verdict, int]:
+    """Add seeds until `judge` decides or the deadline has passed."""
+    for sampler in (estimate, reference):
+        # two are needed for any statement at all, the rest only while there is time
+        while sampler.seeds < 2 or (sampler.seeds < MIN_SEEDS and time.perf_counter() < deadline):
+            sampler.add(2)
+    size = estimate.images.mean().shape
+    if block is not None and block > min(size[:2]):
+        raise OptionError(f"block = {block} is larger than the image, {size[1]} x {size[0]} px")
+    block = block or default_block(size)
+    f1, f2 = reference.halves
+    while True:
+        verdict = judge(estimate.images, f1, f2, block, floor=reference.floor(block), **rule)
+        now = time.perf_counter()
+        if progress is not None:
+            progress(now - start, verdict)
+        if verdict.verdict != INCONCLUSIVE or now >= deadline:
+            return verdict, block
+        sampler = _most_useful(estimate, reference)
+        if verdict.reason.startswith(SCATTER) and min(estimate.seeds, reference.seeds) < SETTLED_SEEDS:
+            sampler = estimate if estimate.seeds < reference.seeds else reference
+        rate = sampler.seconds / sampler.seeds
+        # growing batches keep the share of bookkeeping constant, short enough not to miss the deadline
+        sampler.add(int(np.clip(min(sampler.seeds // 3, (deadline - now) / rate), 1, 256)))
+
+
+def _most_useful(estimate: DerivativeSampler, reference: CentralDifference) -> Any:
+    """The sampler that lowers the variance of the gain most per second."""
+    f1, f2 = reference.halves
+    slope = gain(estimate.images.group_means(), f1.group_means(), f2.group_means())
+    if not slope.has_signal:
+        return reference if reference.seconds <= estimate.seconds else estimate
+    # adding one second's worth of seeds lowers a variance V after t seconds by about V / t
+    by_estimate = slope.stderr_estimate**2 / estimate.seconds
+    by_reference = slope.stderr_reference**2 / reference.seconds
+    return estimate if by_estimate > by_reference else reference

@@ -1,0 +1,58 @@
+"""What would be computed? The public way to ask for a plan, with the sizes of its edge sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..driver.prepare import prepare
+from ..driver.terms import Term
+from ..edges.table import scene_edges
+from ..errors import OptionError
+from ..plan import plan as plans
+from ..plan.job import Job
+from ..plan.plan import EdgeCount, Plan
+from ..scene.io import find_sensor
+from ..scene.params import also_enabled
+from .integrator_specs import build, integrator_spec
+
+#: Why edges are left out of a term's distribution.
+LEFT_OUT = {
+    "primary": "the others rest, are coplanar, turn away or leave the film",
+    "direct": "no light sees the others as an outline, or they are coplanar",
+    "indirect": "the others are coplanar, or lie inside of closed surfaces",
+}
+
+
+def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
+    """What differentiating `scene` by the parameters with gradients enabled would do.
+
+    Traces rays only where form or budgets depend on noise, for a pilot of a few samples per pixel. `params`: name or
+    names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing more). `sensor`: its
+    index, or the sensor. `integrator`: a `psdr_path`, a dict of its properties, or None. `spp`: as in `mi.render`, 0:
+    what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what rendering would raise:
+    `OptionError`, `SceneError`, `UnsupportedError`.
+    """
+    view = find_sensor(scene, sensor)
+    if not hasattr(integrator, "call"):
+        integrator = build(integrator_spec(scene, integrator))
+    if not hasattr(integrator, "call"):
+        raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path")
+    names = [] if params is None or isinstance(params, mi.SceneParameters) else params
+    names = [names] if isinstance(names, str) else list(names)
+    with also_enabled(scene, names):
+        prepared = prepare(integrator.call(scene, view, 0, spp))
+        counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.weights is not None}
+    return plans.with_edges(prepared.plan, counts)
+
+
+def _count(term: Term, job: Job) -> EdgeCount:
+    table = scene_edges(job)
+    total = table.segment_count + table.buried + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
+    with dr.suspend_grad():
+        weights = term.weights(job)
+    sampled = 0 if weights is None else int(np.count_nonzero(np.array(weights)))
+    return EdgeCount(sampled, total, LEFT_OUT[term.name], table.buried)

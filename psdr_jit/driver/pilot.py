@@ -1,0 +1,139 @@
+"""How noisy is each term, in each form? Measured with a few samples of a trial motion, and kept.
+
+What is measured (`plan/probe_motion.py`) is the same for forward and backward mode, and its random numbers are its
+own: weights made from it leave every estimate unbiased. Costs are counted, not timed, so that a seed gives the same
+image on any machine. Samples of boundary terms are stratified along the edges: the variance of a term falls as n^-p,
+p between 1 and 3, which two sample counts tell. The budgets minimise Σ V_t(n_t) at the cost Σ C_t n_t of equal
+budgets, hence
+
+    p_t V_t(n_t) / (C_t n_t) = λ        for all terms, λ found by bisection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..plan.job import Job
+from .terms import TERMS
+
+#: Independent images per term and sample count, and the paths per pixel of each.
+IMAGES, FEW, MORE = 3, 1, 4
+
+#: Seeds of the pilot: far from those that a loop counts up from 0.
+FIRST_SEED = 0x5EED0000
+
+#: Derivative calls after which the pilot is run again, as the scene has changed: a power of two, see `noise_log`.
+REFRESH = 256
+
+#: Least and largest number of a term's paths relative to equal budgets: the pilot may have missed something rare.
+LEAST, MOST = 1 / 8, 8.0
+
+#: Between independent samples and stratified ones of a smooth function of one variable.
+SLOWEST, FASTEST = 1.0, 3.0
+
+#: Time of a path relative to one of the interior term (medians over the shipped scenes, two cores).
+RELATIVE_COST = {"interior": 1.0, "primary": 1.1, "direct": 1.1, "indirect": 0.9}
+DIRECT_UNDER_SKY = 2.5  # more lines are drawn than end on anything
+INDIRECT_ON_MATERIAL = 0.6  # one side of an edge is traced
+
+
+@dataclass(frozen=True)
+class TermNoise:
+    """Variance per pixel by paths per pixel: `at_more` · (n / MORE)^−p. `cost`: of a path, see `RELATIVE_COST`."""
+
+    at_more: float
+    p: float
+    cost: float
+
+    @staticmethod
+    def between(few: float, more: float, cost: float) -> TermNoise:
+        """From the variances at `FEW` and `MORE` paths."""
+        p = math.log(few / more) / math.log(MORE / FEW) if few > 0 and more > 0 else SLOWEST
+        return TermNoise(max(more, 0.0), min(max(p, SLOWEST), FASTEST), cost)
+
+    def at(self, n: float) -> float:
+        return self.at_more * (n / MORE) ** -self.p
+
+    def observed(self, variance: float, n: int, weight: float) -> TermNoise:
+        """Moved by `weight` towards a variance that was seen at n paths."""
+        seen = variance * (n / MORE) ** self.p
+        return replace(self, at_more=(1 - weight) * self.at_more + weight * seen)
+
+    def wish(self, price: float, least: float, most: float) -> float:
+        """Paths at which one more is worth `price` times its cost."""
+        gain = self.p * self.at_more * MORE**self.p / (self.cost * price)
+        return min(max(gain ** (1 / (self.p + 1)), least), most)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Noise by form and name of the term."""
+
+    noise: Mapping[str, Mapping[str, TermNoise]]
+
+    def observed(self, form: str, name: str, variance: float, n: int, weight: float) -> Measurement:
+        """See `TermNoise.observed`."""
+        terms = {**self.noise[form], name: self.noise[form][name].observed(variance, n, weight)}
+        return Measurement({**self.noise, form: terms})
+
+    def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
+        """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""
+        terms = {name: self.noise[form][name] for name in self.noise[form] if name in names}
+        total = sum(t.cost * spp[name] for name, t in terms.items())
+        if not any(t.at_more > 0 for t in terms.values()):
+            return dict(spp)
+
+        def wishes(price: float) -> dict[str, float]:
+            return {name: t.wish(price, LEAST * spp[name], MOST * spp[name]) for name, t in terms.items()}
+
+        low, high = -80.0, 80.0  # logarithms of the price
+        for _ in range(60):
+            middle = (low + high) / 2
+            found = wishes(math.exp(middle))
+            cheap = sum(terms[name].cost * n for name, n in found.items()) > total
+            low, high = (middle, high) if cheap else (low, middle)
+        return {**spp, **{name: max(1, round(n)) for name, n in found.items()}}
+
+    def efficiency(self, form: str, spp: Mapping[str, int]) -> float:
+        """Variance × cost with these budgets; the lower the better."""
+        terms = self.noise[form].items()
+        return sum(t.at(spp[name]) for name, t in terms) * sum(t.cost * spp[name] for name, t in terms)
+
+
+def measure(
+    job_of: Callable[[str, int, int], Job], forms: Iterable[str], names: Iterable[str], sky: bool
+) -> Measurement:
+    """Run the pilot for `forms` and the terms called `names`. `job_of(form, seed, spp)`: a job with a trial motion."""
+    found: dict[str, dict[str, TermNoise]] = {}
+    for form in forms:
+        found[form] = {}
+        for term in (t for t in TERMS if t.name in names):
+            few, more = (
+                _variance([term.forward(job_of(form, FIRST_SEED + k, spp)) for k in range(IMAGES)])
+                for spp in (FEW, MORE)
+            )
+            found[form][term.name] = TermNoise.between(few, more, _cost(term.name, form, sky))
+    return Measurement(found)
+
+
+def _cost(name: str, form: str, sky: bool) -> float:
+    if name == "direct" and sky:
+        return DIRECT_UNDER_SKY
+    return INDIRECT_ON_MATERIAL if name == "indirect" and form == "material" else RELATIVE_COST[name]
+
+
+def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.Float:
+    """Mean over the pixels of the variance of which two images are samples. Not evaluated."""
+    return dr.mean(dr.square(a - b), axis=None).array / 2
+
+
+def _variance(images: list[mi.TensorXf]) -> float:
+    """Mean over the pixels of the variance between images."""
+    mean = sum(images[1:], images[0]) / len(images)
+    spread = sum(dr.mean(dr.square(image - mean), axis=None) for image in images)
+    return float(spread.array[0]) / (len(images) - 1)

@@ -1,0 +1,74 @@
+"""Edges that no path can reach, because they lie inside of another solid body: the sunk part of a box.
+
+A body counts if it is closed, convex and opaque, and nothing inside of it sees or shines: then no path gets into it,
+and an edge whose ends are both inside is inside as a whole. A convex body is the part of space behind all its faces.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.compat import mesh_faces, mesh_positions
+from ..core.sensor_frame import SensorFrame, origin_box
+from ..plan.job import Job
+from ..scene.facts import EmitterFacts, ShapeFacts
+from .convexity import is_convex_body
+from .overlaps import apart
+from .rows import EdgeRows
+
+#: Faces of a body up to which edges are looked for inside of it: each edge is compared with each of its faces.
+MAX_FACES = 64
+
+#: Depth below the faces, relative to the extent of the body and to the largest coordinate, beyond rounding.
+DEPTH, ROUNDING = 1e-4, 1e-6
+
+
+def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts], frame: SensorFrame) -> mi.Bool | None:
+    """Rows that lie inside of one of `bodies`. None if none of these can hide anything."""
+    found = None
+    for body in bodies:
+        if _may_hide(job, body, frame):
+            inside = _is_inside(job.scene.shapes()[body.index], body, rows, job.facts.reach)
+            found = inside if found is None else found | inside
+    return found
+
+
+def _may_hide(job: Job, body: ShapeFacts, frame: SensorFrame) -> bool:
+    """Is this a body that no path gets into?"""
+    shape = job.scene.shapes()[body.index]
+    small = body.plugin == "sphere" or (body.is_mesh and body.faces <= MAX_FACES)
+    if not body.opaque or body.is_emitter or body.has_medium or not small:
+        return False
+    starts = [origin_box(frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
+    outside = all(apart(*start, shape.bbox()) for start in starts)
+    return outside and is_convex_body(shape, body, job.cache)
+
+
+def _place(job: Job, index: int, facts: EmitterFacts) -> tuple:
+    """Lower and upper corner of a box around a light; of the whole scene if its place is not known."""
+    box = job.scene.emitters()[index].bbox()
+    if facts.shape >= 0:
+        owner = job.facts.shapes[facts.shape].index
+        box = job.scene.shapes()[owner].bbox() if owner >= 0 else job.scene.bbox()
+    return box.min, box.max
+
+
+def _is_inside(shape: mi.Shape, facts: ShapeFacts, rows: EdgeRows, reach: float) -> mi.Bool:
+    """Are both ends of an edge well inside of a convex body?"""
+    box = shape.bbox()
+    depth = dr.opaque(mi.Float, DEPTH * float(dr.norm(box.extents())) + ROUNDING * reach)
+    if facts.plugin == "sphere":
+        centre = dr.opaque(mi.Point3f, list(box.center()))
+        radius = dr.opaque(mi.Float, float(box.extents().x) / 2)
+        return dr.maximum(dr.norm(rows.p0 - centre), dr.norm(rows.p1 - centre)) < radius - depth
+    positions, faces = dr.detach(mesh_positions(shape)), mesh_faces(shape)
+    a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in (faces.x, faces.y, faces.z))
+    n = dr.normalize(dr.cross(b - a, c - a))
+    offset = dr.dot(n, a)
+    dr.eval(n, offset)
+    inside = mi.Bool(True)
+    for k in range(facts.faces):
+        n_k, offset_k = dr.gather(type(n), n, k), dr.gather(mi.Float, offset, k)
+        inside &= dr.maximum(dr.dot(n_k, rows.p0), dr.dot(n_k, rows.p1)) < offset_k - depth
+    return inside

@@ -1,0 +1,69 @@
+"""Which bodies are convex? If there is only one, and it is, nothing casts a shadow and no surface sees another."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.sensor_frame import origin_box, sensor_frame
+from ..scene.capabilities import SUPPORTED_SENSORS
+from ..scene.facts import SceneFacts, ShapeFacts
+from .overlaps import apart
+from .shells import edge_shells
+from .topology import build_edge_topology
+
+#: Pairs of a face and a vertex up to which a mesh is looked at.
+MAX_PAIRS = 2**22
+
+#: Height of a vertex above the plane of a face, relative to the extent of the mesh, that counts as rounding.
+FLATNESS = 1e-5
+
+
+def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, cache: dict) -> str:
+    """Name of the scene's only shape if it is convex, opaque, and the sensor outside of its bounding box; else ""."""
+    if len(facts.shapes) != 1 or facts.sensor.plugin not in SUPPORTED_SENSORS:
+        return ""
+    only = facts.shapes[0]
+    if only.index < 0 or not only.opaque:
+        return ""
+    box, (lower, upper) = scene.bbox(), origin_box(sensor_frame(sensor))
+    if not apart(lower, upper, box):
+        return ""
+    flat = only.plugin in ("disk", "rectangle")
+    return only.name if flat or is_convex_body(scene.shapes()[0], only, cache) else ""
+
+
+def is_convex_body(shape: mi.Shape, facts: ShapeFacts, cache: dict) -> bool:
+    """Is it a sphere, or a closed convex mesh with its normals outward? False of meshes too large to look at."""
+    if facts.plugin == "sphere":
+        return True
+    if not facts.is_mesh or facts.faces * shape.vertex_count() > MAX_PAIRS:
+        return False
+    return _is_closed(shape, cache) and _is_behind_its_faces(shape)
+
+
+def _is_closed(mesh: mi.Mesh, cache: dict) -> bool:
+    """One closed surface with its normals outward. Remembered while the faces are the same."""
+    faces = faces_buffer(mesh)
+    key = ("closed", mesh.id())
+    known = cache.get(key)
+    if known is None or not same_faces(known[0], faces):
+        p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
+        topology = build_edge_topology(p, f)
+        cache[key] = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
+    return cache[key][1]
+
+
+def _is_behind_its_faces(mesh: mi.Mesh) -> bool:
+    """Is every vertex on or behind the plane of every face?"""
+    positions, faces = dr.detach(mesh_positions(mesh)), mesh_faces(mesh)
+    n = dr.width(positions)
+    pair = dr.arange(mi.UInt32, dr.width(faces) * n)
+    corners = dr.gather(mi.Vector3u, faces, pair // n)
+    a, b, c = (dr.gather(mi.Point3f, positions, corners[k]) for k in range(3))
+    normal = dr.normalize(dr.cross(b - a, c - a))
+    height = dr.dot(normal, dr.gather(mi.Point3f, positions, pair % n) - a)
+    extent = dr.opaque(mi.Float, float(dr.norm(mesh.bbox().extents())))
+    return not dr.any(height > FLATNESS * extent)[0]

@@ -1,0 +1,206 @@
+"""Where two surfaces cut into each other: segments between triangles, arcs between a ball and triangles. Pure NumPy.
+
+The curve along which two shapes intersect is seen like an edge, but no mesh edge lies on it. Between two triangles it
+is a segment whose ends are the points where an edge of one pierces the other [Möller 1997].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .topology import INVALID
+
+#: Pairs of an edge and a triangle that are tested at once (memory), and in all (time) for one pair of meshes.
+CHUNK = 1 << 18
+MAX_TESTS = 1 << 24
+
+#: Surfaces closer than this, relative to their coordinates, rest on each other: their own edges are what is seen.
+RESTING = 1e-5
+
+#: Sine of the angle between two faces below which they count as parallel.
+PARALLEL = 1e-3
+
+
+class TooManyPairs(Exception):
+    """Two meshes whose overlap is too dense for testing every edge against every triangle."""
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Positions and topology of one mesh, as NumPy arrays."""
+
+    positions: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3)
+    edges: np.ndarray  # (E, 2) vertices
+    edge_faces: np.ndarray  # (E, 2), INVALID where there is none
+
+    @property
+    def box(self) -> np.ndarray:
+        return np.stack([self.positions.min(0), self.positions.max(0)])
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Common segments of triangle pairs: N rows."""
+
+    face_a: np.ndarray  # (N,)
+    face_b: np.ndarray
+    start: np.ndarray  # (N, 3)
+    end: np.ndarray
+
+
+def tolerance(*boxes: np.ndarray) -> float:
+    """Absolute distance below which surfaces within these boxes count as touching."""
+    return RESTING * max(np.abs(box).max() + np.linalg.norm(box[1] - box[0]) for box in boxes)
+
+
+def overlap(box_a: np.ndarray, box_b: np.ndarray, margin: float) -> np.ndarray | None:
+    """The common part of two boxes (2, 3), widened; None if they are apart."""
+    lower, upper = np.maximum(box_a[0], box_b[0]) - margin, np.minimum(box_a[1], box_b[1]) + margin
+    return None if np.any(lower > upper) else np.stack([lower, upper])
+
+
+def mesh_mesh(a: TriangleMesh, b: TriangleMesh) -> Segments:
+    """Segments along which faces of two meshes cross. Raises `TooManyPairs` where the overlap is too dense."""
+    tol = tolerance(a.box, b.box)
+    common = overlap(a.box, b.box, tol)
+    hits = []
+    if common is not None:
+        for own, other, swap in ((a, b, False), (b, a, True)):
+            edge, face, x = _pierced(own, other, common, tol)
+            for side in own.edge_faces[edge].T:
+                has = side != INVALID
+                pair = (face[has], side[has]) if swap else (side[has], face[has])
+                hits.append((*pair, x[has]))
+    if not hits:
+        return _segments(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), len(b.faces))
+    face_a, face_b, x = (np.concatenate(column) for column in zip(*hits, strict=True))
+    return _segments(face_a.astype(np.int64), face_b.astype(np.int64), x, len(b.faces))
+
+
+def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Which of `corners` (N, k) have bounding boxes that overlap `box`? By the outcodes of the vertices."""
+    code = np.zeros(len(positions), np.uint8)
+    for axis in range(3):
+        code |= (positions[:, axis] < box[0, axis]).astype(np.uint8) << (2 * axis)
+        code |= (positions[:, axis] > box[1, axis]).astype(np.uint8) << (2 * axis + 1)
+    return np.flatnonzero(np.bitwise_and.reduce(code[corners], axis=1) == 0)
+
+
+def _pierced(own: TriangleMesh, other: TriangleMesh, box: np.ndarray, tol: float):
+    """Edges of `own` through faces of `other`: `(edge, face, point)`."""
+    edge, face = _in_box(own.positions, own.edges, box), _in_box(other.positions, other.faces, box)
+    if len(edge) * len(face) > MAX_TESTS:
+        raise TooManyPairs
+    ends = own.positions[own.edges[edge]].astype(float)
+    corners = other.positions[other.faces[face]].astype(float)
+    found = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))]
+    step = max(1, CHUNK // max(len(face), 1))
+    for i in range(0, len(edge), step):
+        e, f, x = _crossings(ends[i : i + step], corners, tol)
+        found.append((edge[i + e], face[f], x))
+    return tuple(np.concatenate(column) for column in zip(*found, strict=True))
+
+
+def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
+    """All pairs (segment, triangle) that cross: `(segment, triangle, point)`. An end in the plane is no crossing."""
+    p, q, r = corners[:, 0], corners[:, 1], corners[:, 2]
+    n = np.cross(q - p, r - p)
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    level = np.einsum("ij,ij->i", n, p)
+    d0, d1 = (ends[:, k] @ n.T - level for k in (0, 1))
+    e, f = np.nonzero((d0 * d1 < 0) & (np.minimum(np.abs(d0), np.abs(d1)) > tol))
+    t = d0[e, f] / (d0[e, f] - d1[e, f])
+    x = ends[e, 0] + t[:, None] * (ends[e, 1] - ends[e, 0])
+    weights = barycentric(x, corners[f])
+    inside = weights.min(1) >= -1e-9
+    return e[inside], f[inside], x[inside]
+
+
+def barycentric(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(N, 3) weights of the corners (N, 3, 3) in points of their planes."""
+    u, v, w = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], x - corners[:, 0]
+    uu, uv, vv = (np.einsum("ij,ij->i", *pair) for pair in ((u, u), (u, v), (v, v)))
+    wu, wv = np.einsum("ij,ij->i", w, u), np.einsum("ij,ij->i", w, v)
+    det = uu * vv - uv**2
+    det = np.where(det > 0, det, np.inf)
+    b1, b2 = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    return np.stack([1 - b1 - b2, b1, b2], axis=1)
+
+
+def _segments(face_a: np.ndarray, face_b: np.ndarray, x: np.ndarray, stride: int) -> Segments:
+    """Join the hits of each pair of faces: of more than two, the two farthest apart."""
+    key = face_a * stride + face_b
+    order = np.argsort(key, kind="stable")
+    _, first, count = np.unique(key[order], return_index=True, return_counts=True)
+    two = first[count == 2]
+    more = [_farthest(x, order[i : i + n]) for i, n in zip(first[count > 2], count[count > 2], strict=True)]
+    pairs = np.concatenate([np.stack([order[two], order[two + 1]], 1), np.array(more, dtype=int).reshape(-1, 2)])
+    long = np.linalg.norm(x[pairs[:, 1]] - x[pairs[:, 0]], axis=1) > 0
+    i, j = pairs[long].T
+    return Segments(face_a[i], face_b[i], x[i], x[j])
+
+
+def _farthest(x: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
+    distance = np.linalg.norm(x[rows][:, None] - x[rows][None], axis=2)
+    i, j = np.unravel_index(np.argmax(distance), distance.shape)
+    return rows[i], rows[j]
+
+
+@dataclass(frozen=True)
+class Arcs:
+    """Pieces of the circles in which a ball cuts faces: chords (N rows) to be bent onto their circles."""
+
+    face: np.ndarray  # (N,)
+    start: np.ndarray  # (N, 3)
+    end: np.ndarray
+    centre: np.ndarray  # (N, 3) of the circle
+    radius: np.ndarray  # (N,)
+
+
+def ball_mesh(centre: np.ndarray, radius: float, b: TriangleMesh, pieces: int) -> Arcs:
+    """Arcs in which the sphere cuts faces of `b`; the ends of the arcs lie on the faces' edges, up to rounding."""
+    box = np.stack([centre - radius, centre + radius])
+    tol = tolerance(box, b.box)
+    out = []
+    for f in _in_box(b.positions, b.faces, box):
+        corners = b.positions[b.faces[f]].astype(float)
+        p, q, r = corners
+        n = np.cross(q - p, r - p)
+        n /= max(np.linalg.norm(n), 1e-300)
+        height = n @ (centre - p)
+        if abs(height) >= radius - tol:
+            continue
+        middle, size = centre - height * n, np.sqrt(radius**2 - height**2)
+        for start, end in _inside_arcs(middle, size, n, corners, pieces):
+            out.append((f, start, end, middle, size))
+    if not out:
+        return Arcs(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return Arcs(*(np.array(column) for column in zip(*out, strict=True)))
+
+
+def _inside_arcs(middle, size, n, corners, pieces: int):
+    """Chords of the parts of a circle that lie inside a triangle of the same plane."""
+    u = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+    u /= np.linalg.norm(u)
+    v = np.cross(n, u)
+    cuts = [0.0, 2 * np.pi]
+    for k in range(3):  # angles at which the circle crosses the triangle's sides
+        a, b = corners[k], corners[(k + 1) % 3]
+        d = np.cross(n, b - a)
+        d /= np.linalg.norm(d)
+        reach = d @ (a - middle) / size
+        if abs(reach) < 1:
+            towards = np.arctan2(d @ v, d @ u)
+            cuts += [(towards + s * np.arccos(reach)) % (2 * np.pi) for s in (-1, 1)]
+    cuts = np.unique(cuts)
+    for begin, stop in zip(cuts[:-1], cuts[1:], strict=True):
+        at = 0.5 * (begin + stop)
+        x = middle + size * (np.cos(at) * u + np.sin(at) * v)
+        if barycentric(x[None], corners[None]).min() < 0:
+            continue
+        angles = np.linspace(begin, stop, 2 + int(pieces * (stop - begin) / (2 * np.pi)))
+        points = middle + size * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
+        yield from zip(points[:-1], points[1:], strict=True)

@@ -1,0 +1,44 @@
+"""From a row of the junctions to a point of the curve: its place, and how it moves."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Hit
+from .junctions import JunctionRows, Sheet
+
+#: Length of the ray by which a ball's surface point is addressed, relative to its coordinates.
+PROBE = 1e-2
+
+
+def bend(rows: JunctionRows, index: mi.UInt32, x: mi.Point3f, dx: mi.Vector3f, active):
+    """Carry a point of an arc's chord and its derivative onto the circle; `index` is `EdgeRows.junction`."""
+    on_arc = active & (index > 0)
+    radius = dr.gather(mi.Float, rows.arc_radius, index - 1, on_arc)
+    on_arc &= radius > 0
+    offset = x - dr.gather(mi.Point3f, rows.arc_centre, index - 1, on_arc)
+    distance = dr.norm(offset)
+    axis = mi.Vector3f(offset / distance)
+    scale = radius / distance
+    bent = x + (scale - 1) * offset
+    return dr.select(on_arc, bent, x), dr.select(on_arc, scale * (dx - axis * dr.dot(axis, dx)), dx)
+
+
+def junction_motion(rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Point3f, active) -> mi.Vector3f:
+    """Vector of value 0 whose derivative is the velocity of the curve at x, attached to both surfaces."""
+    sheets = [dr.gather(Sheet, sheet, index - 1, active) for sheet in (rows.a, rows.b)]
+    n_a, n_b = (dr.select(s.is_ball, dr.normalize(mi.Vector3f(x - s.centre)), mi.Vector3f(s.n)) for s in sheets)
+    moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, active)) for n, s in zip((n_a, n_b), sheets, strict=True))
+    c = dr.dot(n_a, n_b)
+    scale = dr.rcp(dr.squared_norm(dr.cross(n_a, n_b)))  # 1 − c² without cancellation
+    return (n_a - c * n_b) * scale * moved_a + (n_b - c * n_a) * scale * moved_b
+
+
+def _moved(s: Sheet, n: mi.Vector3f, t: mi.Float, x: mi.Point3f, active) -> mi.Vector3f:
+    """Attached displacement (value 0) of the material point of a surface at x."""
+    height = PROBE * (1 + dr.max(dr.abs(x)))
+    hit = Hit(x + height * n, -n, height, s.shape, s.prim, s.uv_start + t * (s.uv_end - s.uv_start))
+    follow = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+    p = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), follow, active).p
+    return p - dr.detach(p)

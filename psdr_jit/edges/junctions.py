@@ -1,0 +1,264 @@
+"""Curves along which shapes cut into each other, as rows of the edge table with a motion of their own.
+
+A point x of the curve stays on both surfaces, so its velocity w satisfies n_a·w = n_a·v_a and n_b·w = n_b·v_b with v
+the material velocities; along the curve w is arbitrary. With the dual basis g_a, g_b of the normals in their plane,
+
+    w = g_a (n_a·v_a) + g_b (n_b·v_b),        g_a = (n_a − c n_b) / (1 − c²),  c = n_a·n_b,
+
+which needs no derivative of the intersection points themselves.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import mesh_faces, mesh_positions, positions_buffer
+from ..core.upload import uploaded
+from ..errors import UnsupportedWarning
+from . import intersections as cut
+from .overlaps import box_of, crossing
+from .rows import EdgeRows
+from .topology import EdgeTopology
+
+#: Pieces into which the full circle of a ball in a plane is cut.
+ARC_PIECES = 64
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A mesh of an edge set."""
+
+    mesh: mi.Mesh
+    index: int  # in the edge set
+    moves: bool
+    topology: EdgeTopology
+    shell: mi.Float  # by edge of the topology
+
+
+@dataclass(frozen=True)
+class Ball:
+    """An analytic sphere."""
+
+    shape: mi.Shape
+    moves: bool
+
+
+@dataclass
+class Sheet:
+    """One of the two surfaces at a junction; detached, one entry per junction."""
+
+    shape: mi.UInt32  # registry index
+    prim: mi.UInt32
+    uv_start: mi.Point2f  # position on the primitive at both ends of the segment
+    uv_end: mi.Point2f
+    n: mi.Normal3f  # unit; outward where the surface is closed
+    centre: mi.Point3f  # of a ball
+    is_ball: mi.Bool
+
+
+@dataclass
+class JunctionRows:
+    a: Sheet
+    b: Sheet
+    arc_centre: mi.Point3f
+    arc_radius: mi.Float  # 0: a straight segment
+
+
+@dataclass(frozen=True)
+class JunctionTable:
+    """Junctions as rows of the edge table, and what only they have."""
+
+    edges: EdgeRows
+    rows: JunctionRows
+
+
+def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], cache: dict) -> JunctionTable | None:
+    """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `cache`."""
+    found, changed = [], False
+    for a, b in _pairs(solids, balls):
+        key = ("junctions", a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
+        state = (_state(a), _state(b))
+        known = cache.get(key)
+        if known is None or [s.key for s in known[0]] != [s.key for s in state]:
+            known = (state, _pair(a, b))
+            cache[key] = known
+            changed = True
+        if known[1] is not None:
+            found.append(known[1])
+    if not found:
+        return None
+    table = cache.get(("junction table",))
+    if changed or table is None or table[0] != [id(f) for f in found]:
+        table = ([id(f) for f in found], _upload(found), found)
+        cache[("junction table",)] = table
+    return table[1]
+
+
+def _pairs(solids: list[Solid], balls: tuple[Ball, ...]) -> list[tuple[Solid, Solid | Ball]]:
+    """Pairs that may intersect, by their bounding boxes; at least one is a mesh."""
+    items = [*solids, *balls]
+    boxes = [box_of(item.mesh if isinstance(item, Solid) else item.shape) for item in items]
+    return [(items[i], items[j]) for i, j in crossing(boxes) if i < len(solids)]
+
+
+@dataclass(frozen=True)
+class _State:
+    """Changes when the shape does. The buffer is kept alive, so that its index identifies it."""
+
+    key: tuple
+    buffer: mi.Float | None
+
+
+def _state(item: Solid | Ball) -> _State:
+    if isinstance(item, Ball):
+        return _State((item.moves, *box_of(item.shape).ravel()), None)
+    buffer = dr.detach(positions_buffer(item.mesh))
+    return _State((item.moves, item.index, buffer.index), buffer)
+
+
+def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
+    """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
+    mesh_a = _triangles(a)
+    if isinstance(b, Ball):
+        to_world = np.array(dr.detach(mi.traverse(b.shape)["to_world"].matrix), dtype=float).reshape(4, 4)
+        centre, radius = to_world[:3, 3], np.linalg.norm(to_world[:3, 0])
+        arcs = cut.ball_mesh(centre, radius, mesh_a, ARC_PIECES)
+        if len(arcs.face) == 0:
+            return None
+        middle = (arcs.start + arcs.end) / 2 - centre
+        n_b = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+        sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
+        return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
+    try:
+        mesh_b = _triangles(b)
+        found = cut.mesh_mesh(mesh_a, mesh_b)
+    except cut.TooManyPairs:
+        warnings.warn(
+            f"shapes '{a.mesh.id()}' and '{b.mesh.id()}' overlap with too many triangles to look for the curve along "
+            "which they cut into each other: its part of the derivative is missing",
+            UnsupportedWarning,
+            stacklevel=2,
+        )
+        return None
+    sheet_a = _sheet(a, mesh_a, found.face_a, found.start, found.end)
+    sheet_b = _sheet(b, mesh_b, found.face_b, found.start, found.end)
+    steep = np.linalg.norm(np.cross(sheet_a["n"], sheet_b["n"]), axis=1) > cut.PARALLEL
+    if not steep.any():
+        return None
+    sheet_a, sheet_b = ({k: v[steep] for k, v in sheet.items()} for sheet in (sheet_a, sheet_b))
+    arcs = (np.zeros((steep.sum(), 3)), np.zeros(steep.sum()))
+    return found.start[steep], found.end[steep], sheet_a, sheet_b, arcs, a, b
+
+
+def _triangles(solid: Solid) -> cut.TriangleMesh:
+    with dr.suspend_grad():
+        positions = np.array(dr.detach(mesh_positions(solid.mesh))).T
+        faces = np.array(mesh_faces(solid.mesh)).T
+    t = solid.topology
+    return cut.TriangleMesh(positions, faces, np.stack([t.v0, t.v1], 1), np.stack([t.f0, t.f1], 1))
+
+
+def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.ndarray, end: np.ndarray) -> dict:
+    corners = mesh.positions[mesh.faces[face]].astype(float)
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    shells = np.zeros(len(mesh.faces))
+    shells[solid.topology.f0] = np.array(solid.shell)
+    border = solid.topology.border
+    shells[solid.topology.f1[~border]] = np.array(solid.shell)[~border]
+    shell = shells[face]
+    return {
+        "shape": np.full(len(face), _registry_index(solid.mesh)),
+        "prim": face,
+        "uv_start": cut.barycentric(start, corners)[:, 1:],
+        "uv_end": cut.barycentric(end, corners)[:, 1:],
+        "n": n * np.where(shell < 0, -1, 1)[:, None],
+        "centre": np.zeros((len(face), 3)),
+        "is_ball": np.zeros(len(face), bool),
+        "shell": np.abs(shell),
+        "index": np.full(len(face), solid.index),
+    }
+
+
+def _ball_sheet(ball: Ball, n: np.ndarray, centre: np.ndarray) -> dict:
+    count = len(n)
+    return {
+        "shape": np.full(count, _registry_index(ball.shape)),
+        "prim": np.zeros(count, int),
+        "uv_start": np.zeros((count, 2)),
+        "uv_end": np.zeros((count, 2)),
+        "n": n,
+        "centre": np.broadcast_to(centre, (count, 3)),
+        "is_ball": np.ones(count, bool),
+        "shell": np.zeros(count),  # its normal turns along an arc: nothing is pruned by it
+        "index": np.zeros(count, int),
+    }
+
+
+def _registry_index(shape: mi.Shape) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
+def _upload(found: list[tuple]) -> JunctionTable:
+    """Concatenate the pairs and turn them into device arrays."""
+    start, end = (np.concatenate([f[k] for f in found]) for k in (0, 1))
+    a, b = ({key: np.concatenate([f[k][key] for f in found]) for key in found[0][k]} for k in (2, 3))
+    centre, radius = (np.concatenate([f[4][k] for f in found]) for k in (0, 1))
+    moves = np.concatenate([np.full(len(f[0]), f[5].moves or f[6].moves) for f in found])
+    # The halves of the faces in front of each other make a concave edge if the edge runs along n_b × n_a.
+    along = np.einsum("ij,ij->i", end - start, np.cross(b["n"], a["n"])) >= 0
+    swap = ~along[:, None]
+    start, end = np.where(swap, end, start), np.where(swap, start, end)
+    for sheet in (a, b):
+        sheet["uv_start"], sheet["uv_end"] = (
+            np.where(swap, sheet["uv_end"], sheet["uv_start"]),
+            np.where(swap, sheet["uv_start"], sheet["uv_end"]),
+        )
+    count = len(start)
+    arc = radius > 0
+    angle = np.arccos(np.clip(np.einsum("ij,ij->i", a["n"], b["n"]), -1, 1))
+    zeros = uploaded(mi.UInt32, np.zeros(count, np.uint32))
+    none = mi.Vector2u(zeros, zeros)
+    edges = EdgeRows(
+        v0=zeros, v1=zeros, apex0=zeros, apex1=zeros, p0=_point(start), p1=_point(end),
+        n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
+        angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
+        border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),
+        traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
+        junction=_index(np.arange(1, count + 1)),
+        shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),
+        shell1=uploaded(mi.Float, np.where(arc, 0, b["shell"])),
+        shape0=_index(a["index"]), shape1=_index(np.where(b["is_ball"], a["index"], b["index"])),
+        prim0=_index(a["prim"]), prim1=_index(b["prim"]), corner0=none, corner1=mi.Vector2u(none),
+    )  # fmt: skip
+    rows = JunctionRows(_device_sheet(a), _device_sheet(b), _point(centre), uploaded(mi.Float, radius))
+    dr.eval(edges, rows)
+    return JunctionTable(edges, rows)
+
+
+def _device_sheet(s: dict) -> Sheet:
+    return Sheet(
+        _index(s["shape"]), _index(s["prim"]), _point2(s["uv_start"]), _point2(s["uv_end"]),
+        mi.Normal3f(_point(s["n"])), _point(s["centre"]), uploaded(mi.Bool, s["is_ball"]),
+    )  # fmt: skip
+
+
+def _flags(count: int, value: bool) -> mi.Bool:
+    return uploaded(mi.Bool, np.full(count, value))
+
+
+def _index(values: np.ndarray) -> mi.UInt32:
+    return uploaded(mi.UInt32, np.asarray(values, np.uint32))
+
+
+def _point(values: np.ndarray) -> mi.Point3f:
+    return mi.Point3f(*(uploaded(mi.Float, column) for column in np.asarray(values, np.float32).T))
+
+
+def _point2(values: np.ndarray) -> mi.Point2f:
+    return mi.Point2f(*(uploaded(mi.Float, column) for column in np.asarray(values, np.float32).T))

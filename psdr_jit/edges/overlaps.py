@@ -1,0 +1,67 @@
+"""Which pairs of shapes may cut into each other? By bounding boxes; and which of them are not covered."""
+
+from __future__ import annotations
+
+import warnings
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UnsupportedWarning
+from .intersections import RESTING
+
+#: Shapes without triangles.
+ANALYTIC = ("disk", "cylinder", "sphere")
+
+
+def box_of(shape: mi.Shape) -> np.ndarray:
+    box = shape.bbox()
+    return np.array([box.min, box.max], dtype=float)
+
+
+def apart(lower, upper, box: mi.ScalarBoundingBox3f) -> bool:
+    """Does the box with these corners not even touch `box`?"""
+    return any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
+
+
+def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
+    """Pairs i < j of boxes (2, 3) whose shapes may cut into each other. Touching is not cutting."""
+    if len(boxes) < 2:
+        return []
+    lower, upper = np.stack(boxes, axis=1)
+    i, j = np.triu_indices(len(boxes), 1)
+    size = np.abs(np.stack(boxes)).max((1, 2)) + np.linalg.norm(upper - lower, axis=1)
+    tol = RESTING * np.maximum(size[i], size[j])[:, None]
+    common_lower, common_upper = np.maximum(lower[i], lower[j]), np.minimum(upper[i], upper[j])
+    flat_i, flat_j = (upper[k] - lower[k] <= tol for k in (i, j))
+    # A flat shape cuts what extends to both of its sides; two flat ones in one plane do not.
+    lower_of_thick, upper_of_thick = (np.where(flat_i, side[j], side[i]) for side in (lower, upper))
+    through = (common_lower > lower_of_thick + tol) & (common_upper < upper_of_thick - tol)
+    through &= (common_lower <= common_upper + tol) & (flat_i ^ flat_j)
+    cuts = np.all((common_upper - common_lower > tol) | through, axis=1)
+    return list(zip(i[cuts].tolist(), j[cuts].tolist(), strict=True))
+
+
+def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], said: dict) -> None:
+    """Name those of the crossing `pairs` of `(shape, plugin)` whose curve is not looked for, once each."""
+    for i, j in pairs:
+        (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
+        curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
+        covered = not curved or curved == ["sphere"]
+        key = ("pair", a.id(), b.id())
+        if not covered and key not in said and not (curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))):
+            said[key] = True
+            warnings.warn(
+                f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) may cut into each other: the curve where they "
+                "meet is found for meshes and for a sphere in a mesh only, its part of the derivative is missing; "
+                "replace curved shapes by meshes",
+                UnsupportedWarning,
+                stacklevel=2,
+            )
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> bool:
+    """Two balls, given by their boxes, that do not meet, or of which one lies inside the other."""
+    distance = np.linalg.norm(a.mean(0) - b.mean(0))
+    r_a, r_b = (box[1, 0] / 2 - box[0, 0] / 2 for box in (a, b))
+    return distance >= r_a + r_b or distance <= abs(r_a - r_b)

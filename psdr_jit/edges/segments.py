@@ -1,0 +1,272 @@
+"""All straight edges of a scene that may matter, in one table: topology built once, geometry refreshed per call.
+
+Rows of several meshes are concatenated; vertex indices are global, so that one gather fetches an edge point of any
+mesh. The table is detached. Motion is attached separately (`attached_positions`), because an edge table built from
+attached mesh buffers breaks forward mode through `ray_intersect`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.upload import uploaded
+from ..errors import SceneError, UnsupportedWarning
+from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
+from .junctions import Ball, JunctionRows, Solid, find_junctions
+from .rows import EdgeRows, concatenate
+from .shells import edge_shells
+from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
+
+#: Exterior angle below which two flat-shaded faces count as one [rad].
+COPLANAR_ANGLE = 1e-4
+
+#: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
+SEAM_TOLERANCE = 1e-4
+
+
+#: Coinciding edges are looked for among all edges up to this many, among borders only beyond (a cost per call).
+MAX_COMPARED_EDGES = 20000
+
+
+@dataclass
+class _MeshTopology:
+    """Cached per mesh: valid while the faces stay the same and welded vertices stay together."""
+
+    faces: mi.UInt32  # kept alive, so that its index identifies it
+    host: EdgeTopology
+    device: EdgeTopologyDevice
+    shell: mi.Float  # per edge, see EdgeRows
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Straight edges of `meshes`, and the curves along which they cut into each other. `rows`: None without any."""
+
+    meshes: tuple[mi.Mesh, ...]
+    rows: EdgeRows | None
+    shapes: mi.ShapePtr | None  # by EdgeRows.shape0 and shape1
+    junctions: JunctionRows | None  # by EdgeRows.junction
+    normals: mi.Normal3f | None  # by vertex, 0 on flat-shaded meshes; None if all are
+
+
+def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict, balls: tuple[Ball, ...] = ()) -> EdgeSet:
+    """Edges of `meshes` in their present state; topologies are kept in `cache` from call to call.
+
+    Intersection curves of meshes with each other and with `balls` are appended as rows of their own. Coinciding edges
+    of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
+    Raises `SceneError` for empty meshes and non-finite vertices.
+    """
+    if not meshes:
+        return EdgeSet((), None, None, None, None)
+    parts, solids, first_vertex = [], [], 0
+    for i, mesh in enumerate(meshes):
+        positions = dr.detach(mesh_positions(mesh))
+        faces = mesh_faces(mesh)
+        dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
+        topology = _cached_topology(mesh, positions, faces, cache)
+        parts.append(_rows(mesh, positions, faces, topology, i, first_vertex, moving[i]))
+        solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
+        first_vertex += dr.width(positions)
+    rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
+    found = find_junctions(solids, balls, cache)
+    if found is not None:
+        rows = concatenate([rows, found.edges])
+    shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
+    dr.eval(rows)
+    return EdgeSet(tuple(meshes), rows, shapes, None if found is None else found.rows, _normals(meshes))
+
+
+def _normals(meshes: list[mi.Mesh]) -> mi.Normal3f | None:
+    """Shading normals of all vertices, detached."""
+    if not any(_is_smooth(mesh) for mesh in meshes):
+        return None
+    parts = []
+    for mesh in meshes:
+        n = mesh.vertex_count()
+        smooth = _is_smooth(mesh)
+        parts.append(dr.detach(mesh.vertex_normal(dr.arange(mi.UInt32, n))) if smooth else dr.zeros(mi.Normal3f, n))
+    return mi.Normal3f(*(dr.concat([p[axis] for p in parts]) for axis in range(3)))
+
+
+def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
+    """Vertex positions of all meshes, attached, in the order of the global vertex indices."""
+    positions = [mesh_positions(mesh) for mesh in meshes]
+    if len(positions) == 1:
+        return positions[0]
+    return mi.Point3f(*(dr.concat([p[axis] for p in positions]) for axis in range(3)))
+
+
+def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dict) -> _MeshTopology:
+    buffer = faces_buffer(mesh)
+    key = ("edges", mesh.id(), dr.width(positions), dr.width(faces))
+    known = cache.get(key)
+    if known is not None and _still_holds(known, buffer, positions, faces):
+        return known
+    p, f = np.array(positions).T, np.array(faces).T
+    topology = build_edge_topology(p, f)
+    warn_about_mesh(mesh.id(), topology)
+    shell = uploaded(mi.Float, edge_shells(topology, p, f))
+    cache[key] = _MeshTopology(buffer, topology, upload_topology(topology), shell)
+    _still_holds(cache[key], buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
+    return cache[key]
+
+
+def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
+    """Warn about the faces and edges of shape `name` that have no place in a surface, with their number.
+
+    A mesh without any edge is refused: nothing of it can be seen, and there is nothing to sample.
+    """
+    if len(topology) == 0:
+        raise SceneError(f"mesh '{name}' has no face with an area; remove it or fix its file")
+    remarks = (
+        (topology.degenerate_faces, "faces without area, which are left out"),
+        (topology.duplicate_faces, "faces that repeat another one, which are left out"),
+        (topology.nonmanifold_edges, "edges with more than two faces, each of which gets a border there"),
+    )
+    for count, what in remarks:
+        if count:
+            message = f"mesh '{name}' has {count} {what}: silhouettes may be missing or double there"
+            warnings.warn(message, UnsupportedWarning, stacklevel=2)
+
+
+def _still_holds(known: _MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+    return same_faces(known.faces, buffer) and _welds_hold(known.device, positions, faces)
+
+
+def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:
+    tri = dr.gather(mi.Vector3u, faces, face)
+    return dr.select(corner == 0, tri.x, dr.select(corner == 1, tri.y, tri.z))
+
+
+def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+    """Do vertices that were welded still coincide? An optimiser may have pulled split vertices apart."""
+    other = dr.gather(mi.Point3f, positions, _corner_vertex(faces, device.f1, device.corner1.x))
+    own = dr.gather(mi.Point3f, positions, device.v0)
+    gap = dr.max(dr.select(device.border, 0, dr.norm(other - own)))
+    extent = dr.max(dr.max(positions, axis=1) - dr.min(positions, axis=1), axis=None)
+    return bool((gap <= 8 * WELD_TOLERANCE * extent)[0])
+
+
+def _is_smooth(mesh: mi.Mesh) -> bool:
+    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+
+
+def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
+    """Edges along which shading normals or the coordinates of a texture are split."""
+    found = dr.full(mi.Bool, False, dr.width(topo.v0))
+    ends = ((topo.v0, topo.corner1.x), (topo.v1, topo.corner1.y))
+
+    def jumps(vertex_data) -> mi.Bool:
+        jump = mi.Bool(False)
+        for vertex, corner in ends:
+            other = dr.gather(type(vertex_data), vertex_data, _corner_vertex(faces, topo.f1, corner))
+            jump |= dr.norm(other - dr.gather(type(vertex_data), vertex_data, vertex)) > SEAM_TOLERANCE
+        return topo.split & jump
+
+    if _is_smooth(mesh):
+        found |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
+    bsdf = mesh.bsdf()
+    textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+    textured |= mesh.emitter() is not None and mi.has_flag(mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying)
+    if textured and mesh.has_vertex_texcoords():
+        found |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
+    return found
+
+
+def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_vertex: int, moves: bool) -> EdgeRows:
+    topo = topology.device
+    g = edge_geometry(positions, faces, topo)
+    n = dr.width(topo.v0)
+    jumps = _jumps(mesh, faces, topo)
+    return EdgeRows(
+        v0=topo.v0 + first_vertex,
+        v1=topo.v1 + first_vertex,
+        apex0=_corner_vertex(faces, topo.f0, topo.apex0) + first_vertex,
+        apex1=_corner_vertex(faces, topo.f1, topo.apex1) + first_vertex,
+        p0=g.p0,
+        p1=g.p1,
+        n0=g.n0,
+        n1=g.n1,
+        angle=g.angle,
+        blur=g.blur,
+        border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
+        seam=jumps | (g.angle > COPLANAR_ANGLE),
+        smooth=~jumps & _is_smooth(mesh),
+        pattern=jumps,
+        traced=dr.full(mi.Bool, False, n),
+        moves=dr.full(mi.Bool, moves, n),
+        junction=dr.zeros(mi.UInt32, n),
+        shell0=topology.shell,
+        shell1=topology.shell,
+        shape0=dr.full(mi.UInt32, shape, n),
+        shape1=dr.full(mi.UInt32, shape, n),
+        prim0=topo.f0,
+        prim1=mi.UInt32(topo.f1),
+        corner0=topo.corner0,
+        corner1=mi.Vector2u(topo.corner1),
+    )
+
+
+def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
+    """Edges at the same place are one discontinuity and become one row.
+
+    Two borders become an edge with two faces. More than two, or an edge on an edge (stacked boxes), keep one row whose
+    sides are found by tracing rays, because topology no longer says which face is on top. Rows of a moving and of a
+    static shape are left apart: their motion relative to each other is what counts.
+    """
+    dr.eval(rows)
+    border = np.array(rows.border)
+    few = len(border) <= MAX_COMPARED_EDGES
+    candidate = np.arange(len(border)) if few else np.flatnonzero(border)
+    if len(candidate) < 2:
+        return rows
+    group = _coinciding(rows, candidate, np.array(moving)[np.array(rows.shape0)[candidate]])
+    if len(group) == 0:
+        return rows
+    pairs = [g for g in group if len(g) == 2 and border[g].all()]
+    others = [g for g in group if not (len(g) == 2 and border[g].all())]
+    if pairs:
+        _join_borders(rows, np.array(pairs))
+    for g in others:
+        dr.scatter(rows.traced, mi.Bool(True), uploaded(mi.UInt32, g[:1]))
+    keep = np.ones(len(border), bool)
+    for g in group:
+        keep[g[1:]] = False
+    return dr.gather(EdgeRows, rows, uploaded(mi.UInt32, np.flatnonzero(keep)))
+
+
+def _coinciding(rows: EdgeRows, candidate: np.ndarray, motion: np.ndarray) -> list[np.ndarray]:
+    """Groups of two or more rows with the same end points and the same entry in `motion`."""
+    index = uploaded(mi.UInt32, candidate)
+    ends = [np.array(dr.gather(mi.Point3f, p, index)).T for p in (rows.p0, rows.p1)]
+    start, end = weld_vertices(np.concatenate(ends)).reshape(2, -1)
+    count = max(start.max(), end.max()) + 1
+    key = (np.minimum(start, end) * count + np.maximum(start, end)) * 2 + motion
+    order = np.argsort(key, kind="stable")
+    _, first, length = np.unique(key[order], return_index=True, return_counts=True)
+    return [candidate[order[i : i + n]] for i, n in zip(first[length > 1], length[length > 1], strict=True)]
+
+
+def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
+    """Give the first border of every pair the second one's face, in place."""
+    a, b = uploaded(mi.UInt32, pairs[:, 0]), uploaded(mi.UInt32, pairs[:, 1])
+
+    def of(values, index):
+        return dr.gather(type(values), values, index)
+
+    # Seen from face a, face b continues the surface if it runs along the edge the other way round.
+    parallel = dr.dot(of(rows.p1, a) - of(rows.p0, a), of(rows.p1, b) - of(rows.p0, b)) > 0
+    n1, corner1 = of(rows.n0, b), of(rows.corner0, b)
+    dr.scatter(rows.n1, dr.select(parallel, -n1, n1), a)
+    dr.scatter(rows.corner1, dr.select(parallel, corner1, mi.Vector2u(corner1.y, corner1.x)), a)
+    dr.scatter(rows.prim1, of(rows.prim0, b), a)
+    dr.scatter(rows.shape1, of(rows.shape0, b), a)
+    dr.scatter(rows.border, mi.Bool(False), a)
+    dr.scatter(rows.smooth, mi.Bool(False), a)
+    dr.scatter(rows.seam, mi.Bool(True), a)

@@ -1,0 +1,1 @@
+"""The interior term: the derivative of what is smooth along every path."""

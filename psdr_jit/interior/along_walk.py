@@ -1,0 +1,74 @@
+"""Forward derivative where no path changes: taken along the primal walk, with nothing recorded.
+
+While only materials and emission depend on θ, directions and measures are constants. What is left of the derivative of
+a path is
+
+    dL = Σ_k [ β̇_k L_k + β_k (L̇_e,k + ḟ_k(ω_em) L_em + f_k(ω_em) L̇_em) ],      β̇_{k+1} = β̇_k w_k + β_k ḟ_k(ω_{k+1}) / p
+
+with L_k what vertex k emits and scatters from an emitter sample ω_em. It is `sweeps.forward_sweep` of these scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.ad import tangents
+from ..paths.walk import NoSink, Scatter
+
+
+@dataclass
+class MaterialTangents(NoSink):
+    """A sink of `paths.walk.walk` that sums up derivatives; a PyTree, so that it is part of the loop's state."""
+
+    dL: mi.Spectrum  # derivative of the path's radiance so far
+    β_grad: mi.Spectrum  # of the throughput
+
+    @classmethod
+    def zero(cls) -> MaterialTangents:
+        return cls(mi.Spectrum(0), mi.Spectrum(0))
+
+    def scattered(self, k: mi.UInt32, s: Scatter, active: mi.Bool) -> None:
+        """Add what vertex `k` contributes, and carry the throughput's derivative on."""
+        ctx = mi.BSDFContext()
+        smooth = s.goes_on & ~s.delta
+        with dr.resume_grad():
+            f_em = s.bsdf.eval(ctx, s.si, s.ω_em, s.sees_emitter)
+            f = s.bsdf.eval(ctx, s.si, s.wo, smooth)
+            f_em_grad, f_grad = tangents(f_em, f)
+        from_emitter = s.mis_em * s.value_em
+        L = s.emission + dr.select(s.sees_emitter, dr.detach(f_em) * from_emitter, 0)
+        own = dr.select(s.sees_emitter, f_em_grad * from_emitter, 0) + self._from_lights(s, dr.detach(f_em))
+        self.dL += dr.select(active, self.β_grad * L + s.β * own, 0)
+        β_grad = self.β_grad * s.weight + dr.select(smooth, s.β * f_grad * s.inv_pdf, 0)
+        self.β_grad = dr.select(active, β_grad, self.β_grad)
+
+    def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:
+        """What the vertex sends back because lights change."""
+        return mi.Spectrum(0)
+
+
+@dataclass
+class RadianceTangents(MaterialTangents):
+    """The same where emission depends on θ as well."""
+
+    def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:
+        emits = s.weight_emission > 0
+        with dr.resume_grad():
+            met_grad, sampled_grad = tangents(s.emitter.eval(s.si, emits), _radiance(s))
+        direct = dr.select(s.sees_emitter & (s.ds.pdf > 0), f_em * sampled_grad * s.mis_em / s.ds.pdf, 0)
+        return dr.select(emits, s.weight_emission * met_grad, 0) + direct
+
+
+def _radiance(s: Scatter) -> mi.Spectrum:
+    """What the emitter sample sends, attached: `eval`, which all lights have, and for delta ones their own sampling."""
+    emitter, ds = s.ds.emitter, s.ds
+    source = mi.SurfaceInteraction3f(ds, s.si.wavelengths)
+    infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+    source.wi = dr.select(infinite, -ds.d, source.to_local(-ds.d))
+    delta = s.sees_emitter & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+    value = emitter.eval(source, s.sees_emitter & ~delta)
+    _, of_delta = emitter.sample_direction(s.si, mi.Point2f(0.5), delta)
+    return dr.select(delta, of_delta, value)

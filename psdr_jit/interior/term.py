@@ -1,0 +1,207 @@
+"""The interior term as an image: camera rays → recorded paths → sweep → film (estimator: `sweeps.py`).
+
+Only paths that touch something differentiable have a derivative. When neither camera nor emitters are attached,
+a cheap first walk without shadow rays finds those paths and only they are recorded; the rest contribute exactly 0.
+Where that has turned out to be most of them, an integrator no longer looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.ad import accumulate, tangents
+from ..core.low_discrepancy import pixel_sampler
+from ..core.streams import Stream, stream_seed
+from ..paths.dry_walk import count_vertices, touches
+from ..paths.recording import PathRecords
+from ..paths.scattering import UNIFORM_SHARE
+from ..paths.walk import PathLimits, first_hit, walk
+from ..plan.job import Job, passes
+from ..plan.probe_motion import registry_table
+from .along_walk import MaterialTangents, RadianceTangents
+from .sweeps import SceneTraits, backward_sweep, forward_sweep
+
+#: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
+NOMINAL_DEPTH = 16
+
+
+#: Share of paths with a derivative from which looking for them costs more than it saves; the others contribute 0.
+MOST_PATHS = 0.6
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
+
+    spp: int
+    share: float  # of the term's samples
+    seed: mi.UInt32
+    ray: mi.RayDifferential3f
+    weight: mi.Spectrum
+    pos: mi.Point2f
+
+
+class _CameraSampler:
+    """What `ADIntegrator.sample_rays` asks of a sampler, with `spp` well-spread samples in every pixel."""
+
+    def __init__(self, seed: mi.UInt32, pixels: int, spp: int):
+        self._lanes = pixel_sampler(seed, dr.arange(mi.UInt32, pixels * spp), spp)
+        self._spp = spp
+        self.next_1d, self.next_2d = self._lanes.next_1d, self._lanes.next_2d
+
+    def sample_count(self) -> int:
+        return self._spp
+
+
+def _camera_passes(job: Job) -> Iterator[_Pass]:
+    """Camera rays, in passes whose path records fit into `record_mib`."""
+    film = job.film
+    lower, upper = films.sampled_window(film)
+    pixels = int((upper - lower).prod())
+    depth = max(1, min(job.options.depth_limit, NOMINAL_DEPTH))
+    for share, part in passes(job, PathRecords.BYTES_RGB * depth, pixels):
+        films.clear(film)
+        sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
+        ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
+        yield _Pass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
+
+
+def every_path_differs(job: Job) -> bool:
+    """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
+    facts = job.facts
+    emission = any(e.pose or e.radiance for e in facts.emitters)
+    moving_lights = any(s.is_emitter and (s.geometry or s.shading) for s in facts.shapes)
+    return facts.camera_moves or emission or moving_lights or not job.plan.prunes
+
+
+def touch_table(job: Job) -> mi.UInt32:
+    """By shape registry index: 1 if scattering there depends on an enabled parameter."""
+    shapes = job.facts.shapes
+    return registry_table(job.scene, {s.index for s in shapes if s.geometry or s.shading or s.material})
+
+
+def paths_rest(job: Job) -> bool:
+    """Do all enabled parameters belong to BSDFs and to the emission of lights? Then no path changes, nor its frames."""
+    facts = job.facts
+    return job.plan.prunes and not (facts.geometry_moves or any(s.shading for s in facts.shapes))
+
+
+def _limits(job: Job) -> PathLimits:
+    facts = job.facts
+    # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
+    material = any(s.material for s in facts.shapes)
+    rough_glass = any(s.bsdf_flags & int(mi.BSDFFlags.GlossyTransmission) for s in facts.shapes)
+    limits = replace(job.limits, end_black=not material, refuses=material and rough_glass)
+    return replace(limits, uniform_share=UNIFORM_SHARE) if facts.geometry_moves else limits
+
+
+def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
+    """Derivative of every path's radiance by the materials and lights it meets, without records."""
+    ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
+    sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
+    lights = any(e.radiance for e in job.facts.emitters)
+    sink = (RadianceTangents if lights else MaterialTangents).zero()
+    walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
+    return job.rejected.keep_finite(sink.dL)
+
+
+def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
+    """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
+    facts, limits = job.facts, _limits(job)
+    if limits.max_depth == 0:
+        return PathRecords(0, 0), mi.UInt32()
+    ray = mi.Ray3f(dr.detach(p.ray))
+    lane = dr.arange(mi.UInt32, dr.width(p.pos))
+    dr.eval(ray, lane)
+
+    if not every_path_differs(job) and job.cache.get("touched share", 0) < MOST_PATHS:
+        sampler = pixel_sampler(p.seed, lane, p.spp)
+        found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
+        lane = dr.compress(found)
+        job.cache["touched share"] = dr.width(lane) / dr.width(found)
+        if dr.width(lane) == 0:
+            return PathRecords(0, 0), lane
+        ray = dr.gather(mi.Ray3f, ray, lane)
+
+    depth = limits.max_depth
+    if job.options.max_depth == -1:
+        depth = count_vertices(job.scene, pixel_sampler(p.seed, lane, p.spp), ray, limits, job.options.hide_emitters)
+    records = PathRecords(dr.width(lane), depth)
+    ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
+    sampler = pixel_sampler(p.seed, lane, p.spp)
+    _, records.count, _ = walk(
+        job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
+    )
+    records.wavelengths = ray.wavelengths
+    if facts.geometry_moves:
+        job.grazing.count(records.cut())
+    dr.eval(records.count, records.vertices)
+    return records, lane
+
+
+def _traits(job: Job) -> SceneTraits:
+    facts = job.facts
+    delta_lobes = any(s.delta_lobes for s in facts.shapes)
+    moves = facts.geometry_moves or not job.plan.prunes
+    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form, job.trial)
+
+
+def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
+    """How far the recorded camera rays start beyond the sensor's own: behind hidden emitters, 0 otherwise [m]."""
+    if not job.options.hide_emitters:
+        return mi.Float(0)
+    first = records.vertex(mi.UInt32(0), records.count > 0)
+    return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
+
+
+def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
+    """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
+    if paths_rest(job):
+        return _along_the_walk(job, p)
+    records, lane = _record(job, p)
+    dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+    if dr.width(lane) > 0:
+        o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+        if job.facts.camera_moves and job.trial is not None:
+            o_grad, d_grad = job.trial.velocity(p.ray.o), dr.cross(job.trial.turn, p.ray.d)
+        elif job.facts.camera_moves:
+            with dr.resume_grad():
+                o_grad, d_grad = tangents(p.ray.o, p.ray.d)
+            o_grad = o_grad + _skipped(job, p, records) * d_grad
+        recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job))
+        dr.scatter(dL, job.rejected.keep_finite(recorded), lane)
+        dr.eval(dL)  # the splat reads it inside a recorded loop, where pending writes are not seen
+    return dL
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
+    image = 0
+    with dr.suspend_grad():
+        for p in _camera_passes(job):
+            dL = _derivatives(job, p)
+            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+    return image
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.suspend_grad():
+        for p in _camera_passes(job):
+            records, lane = _record(job, p)
+            if dr.width(lane) == 0:
+                continue
+            δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
+            δL = dr.gather(mi.Spectrum, δL, lane)
+            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job))
+            if job.facts.camera_moves:
+                λ_d = λ_d + _skipped(job, p, records) * λ_o
+                with dr.resume_grad():
+                    adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
+                    accumulate(adjoint)  # other terms need the sensor's edges
+            dr.eval()

@@ -1,0 +1,105 @@
+"""Memory for the vertices of a wavefront of paths, so that derivatives can be taken without tracing again."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Arrival, EmitterSample, Hit, Vertex
+from .walk import NoSink, shadow_hit
+
+#: Cosine of arrival below which a vertex has no derivative. A sliding vertex moves by 1/cosθ, and at the outline of a
+#: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
+GRAZING = 5e-4
+
+
+class PathRecords:
+    """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
+
+    A plain class on purpose: Dr.Jit must not take the buffers for loop state. Costs `BYTES_RGB` per vertex.
+    """
+
+    BYTES_RGB = 4 * (11 + 3 + 1 + 10 + 1)
+
+    connect = staticmethod(shadow_hit)
+
+    def __init__(self, lanes: int, depth: int):
+        size = lanes * depth
+        self.lanes, self.depth = lanes, depth
+        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
+        self.whole = dr.full(mi.UInt32, 0xFFFFFFFF, lanes)  # vertices before the first that is met edge-on
+        dr.make_opaque(self.whole)
+        self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
+        self.vertices = Vertex(
+            hit=Hit.made(dr.empty, size),
+            β=dr.empty(mi.Spectrum, size),
+            weight_emission=dr.empty(mi.Float, size),
+            nee=EmitterSample(
+                emitter=dr.empty(mi.UInt32, size),
+                shape=dr.empty(mi.UInt32, size),
+                prim_index=dr.empty(mi.UInt32, size),
+                prim_uv=dr.empty(mi.Point2f, size),
+                d=dr.empty(mi.Vector3f, size),
+                t=dr.empty(mi.Float, size),
+                weight=dr.empty(mi.Float, size),
+            ),
+            inv_pdf=dr.empty(mi.Float, size),
+        )
+
+    def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
+        """Not needed: the sweeps add up radiance themselves."""
+
+    def scattered(self, k: mi.UInt32, scatter, active: mi.Bool) -> None:
+        """End the record before a vertex that is met edge-on: how it slides cannot be told in single precision."""
+        edge_on = active & scatter.si.is_valid() & (dr.abs(dr.dot(scatter.si.n, scatter.arrival)) < GRAZING)
+        # every lane has its own entry; any other mode would compile a kernel for every number of lanes
+        mode = dr.ReduceMode.NoConflicts
+        dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on, mode=mode)
+
+    def cut(self) -> mi.Bool:
+        """Leave out what the walk has met edge-on; returns the lanes of which something was left out."""
+        short = self.whole < self.count
+        self.count = dr.minimum(self.count, self.whole)
+        return short
+
+    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
+        """Store vertex `k` of the active lanes (the sink interface of `walk.walk`)."""
+        dr.scatter(self.vertices, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
+
+    def vertex(self, k: mi.UInt32, active: mi.Bool) -> Vertex:
+        """Vertex `k` of every lane; zero where inactive."""
+        return dr.gather(Vertex, self.vertices, k * self.stride + self.lane, active)
+
+    def arrival(self, k: mi.UInt32, active: mi.Bool) -> Arrival:
+        """Only how vertex `k` was reached, and what its emission counts."""
+        index = k * self.stride + self.lane
+        v = self.vertices
+        return Arrival(
+            hit=dr.gather(Hit, v.hit, index, active),
+            β=dr.gather(mi.Spectrum, v.β, index, active),
+            weight_emission=dr.gather(mi.Float, v.weight_emission, index, active),
+        )
+
+
+class RadianceByDepth(NoSink):
+    """Keeps the radiance of every path length, so that a subpath in front of it can use what its depth leaves."""
+
+    def __init__(self, lanes: int, depth: int):
+        self.lanes, self.depth = lanes, depth
+        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
+        self.lane = dr.arange(mi.UInt32, lanes)
+        self.values = dr.zeros(mi.Spectrum, lanes * depth)
+        self.reached = dr.zeros(mi.UInt32, lanes)  # entries written, per lane
+        dr.make_opaque(self.values, self.reached)
+
+    def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
+        dr.scatter(self.values, L, k * self.stride + self.lane, active)
+        dr.scatter(self.reached, k + 1, self.lane, active)
+
+    def up_to(self, k: mi.UInt32, lane: mi.UInt32, final: mi.Spectrum) -> mi.Spectrum:
+        """Radiance of `lane` with at most `k` segments beyond the first vertex; `final`: of the whole path."""
+        stored = k < dr.gather(mi.UInt32, self.reached, lane)
+        value = dr.gather(mi.Spectrum, self.values, k * self.stride + lane, stored)
+        return dr.select(stored, value, final)

@@ -1,0 +1,43 @@
+"""Which form of the path integral suits a scene, as far as its structure tells; a pilot decides the rest.
+
+Where surfaces of different velocity touch, the geometry term of the material form has a derivative ~ Δv/r of infinite
+variance. The spatial form has no such kernel, but finds an edge at every visible crease.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..options import Options
+from ..scene.facts import SceneFacts
+
+#: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
+CONTACT = 0.02
+
+
+def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[tuple[str, ...], str]:
+    """The forms that come into question, the safer one first, and the reason if there is one only."""
+    if options.form != "auto":
+        return (options.form,), "as asked for"
+    if not facts.geometry_moves:
+        return ("spatial",), "nothing moves, so the forms are the same"
+    if options.depth_limit < 3:
+        return ("spatial",), "light is scattered once at most, so the forms are the same"
+    touching = _touching(scene, facts)
+    if touching:
+        return ("spatial",), f"{touching} touch and move against each other"
+    return ("spatial", "material"), "there is no noise to compare the forms by"
+
+
+def _touching(scene: mi.Scene, facts: SceneFacts) -> str:
+    """Two shapes of which one moves and the other rests, and whose bounding boxes touch; "" if there are none."""
+    shapes = scene.shapes()
+    known = [s for s in facts.shapes if s.index >= 0]
+    for mover in (s for s in known if s.moves):
+        for other in (s for s in known if not s.moves):
+            a, b = shapes[mover.index].bbox(), shapes[other.index].bbox()
+            gap = max(max(b.min[i] - a.max[i], a.min[i] - b.max[i]) for i in range(3))
+            size = min(box.bounding_sphere().radius * 2 for box in (a, b))
+            if gap <= CONTACT * size:
+                return f"'{mover.name}' and '{other.name}'"
+    return ""

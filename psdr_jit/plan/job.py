@@ -1,0 +1,66 @@
+"""What a term needs to know to do its share of one derivative render."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+
+from ..core.counters import Rejected
+from ..options import Options
+from ..paths.walk import PathLimits
+from ..scene.facts import SceneFacts
+from .plan import Plan
+from .probe_motion import Trial
+
+
+@dataclass(frozen=True)
+class Job:
+    """One term's share of a render call. Host data only; `spp` is the term's own budget."""
+
+    integrator: mi.CppADIntegrator  # provides Mitsuba's `sample_rays`
+    scene: mi.Scene
+    sensor: mi.Sensor
+    facts: SceneFacts
+    options: Options
+    plan: Plan
+    cache: dict  # the integrator's: edge sets that outlive a call
+    shared: dict  # of all terms of one render call
+    rejected: Rejected  # the integrator's: counts samples that were not finite ...
+    grazing: Rejected  # ... and paths that end where they meet a surface edge-on
+    seed: int | mi.UInt32
+    spp: int
+    trial: Trial | None = None  # motion that takes the place of the scene's own (forward mode only)
+
+    @property
+    def film(self) -> mi.Film:
+        return self.sensor.film()
+
+    @property
+    def form(self) -> str:
+        """What path vertices do while θ changes, see `options.FORMS`."""
+        return self.plan.form
+
+    @property
+    def limits(self) -> PathLimits:
+        own_frames = any(shape.sees_frame for shape in self.facts.shapes)
+        return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames)
+
+
+def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:
+    """Split a job so that one part's samples fit into `record_mib`: `(share of the samples, part)`.
+
+    `pixels`: samples per spp, by default those of the crop window. Parts have seeds of their own; the split depends on
+    host data only, so forward and backward mode agree on it.
+    """
+    if pixels is None:
+        pixels = int(job.film.crop_size()[0]) * int(job.film.crop_size()[1])
+    fitting = job.options.record_mib * 2**20 // (bytes_per_sample * pixels)
+    per_pass = max(1, min(job.spp, fitting))
+    done = 0
+    while done < job.spp:
+        spp = min(per_pass, job.spp - done)
+        seed = job.seed if done == 0 else mi.sample_tea_32(mi.UInt32(job.seed), mi.UInt32(done))[0]
+        yield spp / job.spp, replace(job, seed=seed, spp=spp)
+        done += spp

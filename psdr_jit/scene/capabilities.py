@@ -1,0 +1,132 @@
+"""What is supported, as data: the lists the scene analysis works from, and the README's support table.
+
+`python -m psdr_jit.scene.capabilities` prints that table.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+PLUGIN_NAMES = {
+    # shapes
+    "Mesh": "mesh", "OBJMesh": "obj", "PLYMesh": "ply", "SerializedMesh": "serialized",
+    "BlenderMesh": "blender", "Cube": "cube", "Rectangle": "rectangle", "Disk": "disk",
+    "Sphere": "sphere", "Cylinder": "cylinder", "Instance": "instance", "ShapeGroupPlugin": "shapegroup",
+    "SDFGrid": "sdfgrid", "Ellipsoids": "ellipsoids", "EllipsoidsMesh": "ellipsoidsmesh",
+    "BSplineCurve": "bsplinecurve", "LinearCurve": "linearcurve",
+    # materials
+    "SmoothDiffuse": "diffuse", "SmoothDielectric": "dielectric", "ThinDielectric": "thindielectric",
+    "SmoothConductor": "conductor", "SmoothPlastic": "plastic", "PolarizedPlastic": "pplastic",
+    "Null": "null", "RoughConductor": "roughconductor", "RoughDielectric": "roughdielectric",
+    "RoughPlastic": "roughplastic", "Principled": "principled", "PrincipledThin": "principledthin",
+    "Measured": "measured", "Hair": "hair", "MaskBSDF": "mask", "TwoSidedBRDF": "twosided",
+    "BlendBSDF": "blendbsdf", "BumpMap": "bumpmap", "NormalMap": "normalmap",
+    # emitters
+    "AreaLight": "area", "DirectionalArea": "directionalarea", "ConstantBackgroundEmitter": "constant",
+    "EnvironmentMapEmitter": "envmap", "SunskyEmitter": "sunsky", "TimedSunskyEmitter": "timed_sunsky",
+    "PointLight": "point", "SpotLight": "spot", "DirectionalEmitter": "directional",
+    "Projector": "projector",
+    # sensors
+    "PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens",
+    "OrthographicCamera": "orthographic", "BatchSensor": "batch", "RadianceMeter": "radiancemeter",
+    "IrradianceMeter": "irradiancemeter", "DistantSensor": "distant", "DistantSensorImpl": "distant",
+    # textures
+    "BitmapTexture": "bitmap", "BitmapTextureImpl": "bitmap", "Checkerboard": "checkerboard",
+    "MeshAttribute": "mesh_attribute", "VolumeAdapter": "volume",
+}  # fmt: skip
+"""C++ class name -> the name used in scene files, which is the one a message should use."""
+
+ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
+
+UNSUPPORTED_SHAPES = {
+    "instance": "load the mesh once per copy instead of instancing it",
+    "shapegroup": "load the mesh once per copy instead of instancing it",
+    "sdfgrid": "extract a mesh, for example with marching cubes",
+    "ellipsoids": "use meshes",
+    "ellipsoidsmesh": "use meshes",
+    "bsplinecurve": "tessellate the curves into a mesh",
+    "linearcurve": "tessellate the curves into a mesh",
+}
+"""Shapes without an edge set: plugin -> the way out."""
+
+INSTANCING = frozenset({"instance", "shapegroup"})
+"""Refused even if nothing moves: a recorded path vertex does not know which instance it is on."""
+
+SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
+"""Sensors whose film position of a scene point is known, so that edges can be projected."""
+
+JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
+"""Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
+
+FRAME_FREE_PLUGINS = frozenset({
+    "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
+    "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",
+})  # fmt: skip
+"""Materials that do not see how the shading frame is turned about the normal, unless flagged as anisotropic."""
+
+SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance")})
+"""(plugin, parameter) of materials with a delta lobe: those that only shape the smooth lobe beside it."""
+
+UNIFORM_EMITTERS = frozenset({"area", "constant", "point", "spot", "directional"})
+"""Lights that look the same from everywhere unless textured, or cannot be seen at all."""
+
+POSE_PARAMETERS = frozenset({
+    "to_world", "position", "direction", "sun_direction",
+    "latitude", "longitude", "timezone", "year", "month", "day", "hour", "minute", "second",
+})  # fmt: skip
+"""Emitter parameters that move the light; all others scale or shape what it emits."""
+
+
+class Row(NamedTuple):
+    feature: str
+    status: str  # "yes", "warning" or "error"
+    note: str
+
+
+_MOVING = "while geometry, a light's pose or the camera is differentiated; "
+
+SUPPORT = (
+    Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
+    Row("smooth-shaded meshes", "yes",
+        "the black fringe inside the outline, where shading normals turn away, counts with the outline: up to 3 % off"),
+    Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
+    Row("SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("instances", "error", "materials as well: load the mesh once per copy"),
+    Row("shape geometry, materials, textures", "yes", ""),
+    Row("camera pose and intrinsics", "yes", ""),
+    Row("perspective, thin lens, orthographic sensor", "yes", ""),
+    Row("batch sensor", "yes", "its sensors are rendered one by one; they need films with its filter and pixel format"),
+    Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
+    Row("area, constant, environment map", "yes", ""),
+    Row("point, spot, directional light", "yes", "a spot without a soft rim: warning"),
+    Row("projector", "warning", _MOVING + "the frame of its picture is a step that is not sampled"),
+    Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
+    Row("rough and diffuse materials", "yes", ""),
+    Row("mirrors, smooth glass and plastic, null, mask, hair", "error",
+        _MOVING + "motion transport through specular vertices is missing"),
+    Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
+        "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
+    Row("blendbsdf of a smooth and a perfectly specular material", "error",
+        "Mitsuba does not report its sampling density"),
+    Row("checkerboard, nearest-neighbour bitmap, bump map, face attributes", "warning",
+        _MOVING + "steps inside a surface may slide and are not sampled"),
+    Row("participating media", "error", "ignored by Mitsuba's path as well"),
+    Row("polarised variants", "error", ""),
+    Row("films that convert samples themselves (specfilm)", "error", ""),
+    Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
+    Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
+    Row("meshes that cut into each other, a sphere in a mesh", "yes", "the curve where they meet; not within one mesh"),
+    Row("cylinders, disks and spheres that cut into other shapes", "warning", "the pair is named; meshes do instead"),
+    Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
+    Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),
+)  # fmt: skip
+
+
+def support_table() -> str:
+    """`SUPPORT` as a Markdown table."""
+    rows = [f"| {row.feature} | {row.status} | {row.note} |" for row in SUPPORT]
+    return "\n".join(["| feature | status | note |", "|---|---|---|", *rows])
+
+
+if __name__ == "__main__":
+    print(support_table())

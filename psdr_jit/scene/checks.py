@@ -1,0 +1,281 @@
+"""What psdr_jit does not model, said by name before a ray is traced.
+
+A silent zero is a defect, and so is refusing a scene for something that does not matter. Hence: terms that
+only exist while something moves (see `SceneFacts.geometry_moves`) are checked only then, and material and
+radiance gradients of the same scene go through.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
+from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
+from .capabilities import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+from .facts import SceneFacts, ShapeFacts
+
+SMALL_SCENE = 0.1
+"""Diagonal [scene units] below which the primary term loses more than 0.2 % (measured on a lit box)."""
+
+BOUNDARY_TERMS = {
+    "direct": (2, "moving shadows of the light sources"),
+    "indirect": (3, "moving occlusion of reflected light"),
+}
+"""Terms that the theory has besides interior and primary: from which max_depth on, and what they stand for."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that stands in the way (`category` an error) or is missing (`category` a warning)."""
+
+    category: type[PsdrError] | type[UserWarning]
+    subject: str  # name of the shape, emitter or sensor; "" if it is the scene as a whole
+    message: str
+
+    @property
+    def is_error(self) -> bool:
+        return issubclass(self.category, PsdrError)
+
+
+def require_supported(facts: SceneFacts) -> None:
+    """Raise if the derivative of this scene would be wrong, warn if a part of it is missing.
+
+    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter.
+    """
+    found = list(findings(facts))
+    errors = [finding for finding in found if finding.is_error]
+    if errors:
+        text = "\n".join(f"- {error.message}" for error in errors) if len(errors) > 1 else errors[0].message
+        raise errors[0].category(text if len(errors) == 1 else f"{len(errors)} obstacles:\n{text}")
+    for finding in found:
+        warnings.warn(finding.message, finding.category, stacklevel=2)
+
+
+def findings(facts: SceneFacts) -> Iterator[Finding]:
+    """Everything `require_supported` reports, as data."""
+    for check in CHECKS:
+        yield from check(facts)
+
+
+def check_parameters(facts: SceneFacts) -> Iterator[Finding]:
+    """Without anything to differentiate, the answer is 0."""
+    if facts.still:
+        yield Finding(ZeroDerivativeWarning, "", f"the derivative is 0: {facts.still}")
+    elif not facts.anything_enabled:
+        yield Finding(
+            ZeroDerivativeWarning, "",
+            "the derivative is 0: no scene parameter has gradients enabled; after params = mi.traverse(scene), call "
+            "dr.enable_grad(params['shape.to_world']) (or assign a value that depends on a variable with "
+            "gradients), then params.update(), and render with mi.render(scene, params)",
+        )  # fmt: skip
+
+
+def check_variant(facts: SceneFacts) -> Iterator[Finding]:
+    """Polarised light is carried by Mueller matrices, which no term here knows."""
+    if facts.polarized:
+        yield Finding(
+            UnsupportedError, "",
+            f"variant '{facts.variant}' is polarised, which psdr_jit does not model; use "
+            f"'{facts.variant.replace('_polarized', '')}'",
+        )  # fmt: skip
+
+
+def check_media(facts: SceneFacts) -> Iterator[Finding]:
+    """Media are refused always: like Mitsuba's `path`, every term here would treat them as vacuum."""
+    for shape in facts.shapes:
+        if shape.has_medium:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"shape '{shape.name}' bounds a participating medium, which psdr_jit (like 'path') ignores; "
+                "remove the medium, or differentiate with 'prbvolpath'",
+            )  # fmt: skip
+    if facts.sensor.has_medium:
+        yield Finding(
+            UnsupportedError, facts.sensor.name,
+            f"sensor '{facts.sensor.name}' is inside a participating medium, which psdr_jit (like 'path') "
+            "ignores; remove the medium, or differentiate with 'prbvolpath'",
+        )  # fmt: skip
+
+
+def check_sensor(facts: SceneFacts) -> Iterator[Finding]:
+    """Moving edges must be projected onto the film."""
+    if facts.geometry_moves and facts.sensor.plugin not in SUPPORTED_SENSORS:
+        alike = "; give each of its sensors a film with the rfilter and pixel_format of the batch, and crop none"
+        way_out = alike if facts.sensor.plugin == "batch" else ""
+        yield Finding(
+            UnsupportedError, facts.sensor.name,
+            f"sensor '{facts.sensor.name}' ({facts.sensor.plugin}) has no primary boundary term{way_out}; "
+            f"use {', '.join(sorted(SUPPORTED_SENSORS))}, or differentiate materials and radiance only",
+        )  # fmt: skip
+
+
+def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
+    """Shapes without an edge set, and malformed ones.
+
+    A static shape without edges is refused as well while anything moves: it casts shadows onto moving
+    surfaces, is seen past moving edges, and its outline moves over the film with the camera. Only when
+    nothing moves do its silhouettes stand still in every view.
+    """
+    if not facts.shapes:
+        yield Finding(UnsupportedError, "", "the scene has no shapes: there is nothing to scatter light; add one")
+    for shape in facts.shapes:
+        label = f"shape '{shape.name}' ({shape.plugin})"
+        if shape.plugin in INSTANCING:
+            text = f"{label}: no term knows on which instance a path was; {UNSUPPORTED_SHAPES[shape.plugin]}"
+            yield Finding(UnsupportedError, shape.name, text)
+            continue
+        if shape.bad_vertices:
+            yield Finding(
+                SceneError, shape.name,
+                f"{label} has {shape.bad_vertices} vertices with NaN or infinite coordinates; repair the "
+                "mesh, or lower the step size of the optimisation",
+            )  # fmt: skip
+        if shape.is_mesh and shape.faces == 0:
+            yield Finding(SceneError, shape.name, f"{label} has no faces; remove it or fix its file")
+        if not facts.geometry_moves:
+            continue
+        if shape.kind == "unsupported":
+            way_out = UNSUPPORTED_SHAPES.get(shape.plugin, "use a mesh")
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"{label} has no edge set, so its silhouettes would be missing from the derivative of this "
+                f"geometry; {way_out}, or differentiate materials and radiance only",
+            )  # fmt: skip
+        if shape.uneven_scale:
+            yield Finding(
+                SceneError, shape.name,
+                f"{label} is stretched or sheared, which Mitsuba renders as an unstretched one; scale it "
+                "evenly, or use a mesh",
+            )  # fmt: skip
+
+
+def check_specular(facts: SceneFacts) -> Iterator[Finding]:
+    """Through a delta lobe the motion of a vertex depends on the motion of the direction: not modelled."""
+    if not facts.geometry_moves:
+        return
+    for shape in facts.shapes:
+        if shape.delta_lobes:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"shape '{shape.name}' has the BSDF '{shape.bsdf}' with perfectly specular or pass-through "
+                f"lobes ({', '.join(shape.delta_lobes)}): motion transport through specular vertices is "
+                "missing; use a rough BSDF (such as roughconductor, roughdielectric or roughplastic), or "
+                "differentiate materials and radiance only",
+            )  # fmt: skip
+
+
+def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
+    """The sweeps take the weight and the direction of a delta lobe for constants (see `sweeps.vertex_terms`)."""
+    for shape in facts.shapes:  # moving geometry, which attaches the normals too, is refused by `check_specular`
+        watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
+        steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]
+        enabled = list(shape.delta_weights) + [f"{shape.name}.{name}" for name in steering]
+        if enabled:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"{', '.join(enabled)}: the derivative through a perfectly specular or pass-through lobe "
+                f"({', '.join(shape.delta_lobes)} of shape '{shape.name}') is not modelled and would be 0; use a rough "
+                "BSDF (such as roughconductor, roughdielectric or roughplastic), or do not enable this parameter",
+            )  # fmt: skip
+        if shape.blends_delta:
+            yield Finding(
+                UnsupportedError, shape.name,
+                f"shape '{shape.name}' has a blendbsdf of a smooth and a perfectly specular BSDF, whose sampling "
+                "density Mitsuba does not report; use a rough BSDF in place of the specular one",
+            )  # fmt: skip
+
+
+def check_extent(facts: SceneFacts) -> Iterator[Finding]:
+    """Mitsuba keeps rays off surfaces by 1e-4 (1 + coordinates), and edges of that size blur."""
+    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE * max(1, facts.reach):
+        text = (f"the scene is only {facts.extent:.2g} units across, up to {facts.reach:.2g} from the origin: "
+                "Mitsuba's ray offsets swallow a part of the derivative (1 % at 0.03, 9 % at 0.003 units across); "
+                "scale the scene up, or move it to the origin")  # fmt: skip
+        yield Finding(UnsupportedWarning, "", text)
+
+
+def check_surface_steps(facts: SceneFacts) -> Iterator[Finding]:
+    """Steps inside a surface slide along it as soon as a ray does, and no edge covers them."""
+    for shape in facts.shapes:
+        if shape.jumps and (facts.geometry_moves or VERTEX_TEXCOORDS in shape.shading):
+            yield _missing_steps(shape.name, f"shape '{shape.name}'", shape.jumps)
+    for emitter in facts.emitters:
+        if emitter.jumps and (facts.geometry_moves or _uv_moves(facts.shapes, emitter.shape)):
+            yield _missing_steps(emitter.name, f"emitter '{emitter.name}' ({emitter.plugin})", emitter.jumps)
+
+
+def _uv_moves(shapes: tuple[ShapeFacts, ...], index: int) -> bool:
+    return index >= 0 and VERTEX_TEXCOORDS in shapes[index].shading
+
+
+def _missing_steps(subject: str, label: str, jumps: tuple[str, ...]) -> Finding:
+    return Finding(
+        UnsupportedWarning, subject,
+        f"{label} has steps inside its surface ({', '.join(jumps)}): where they slide, their part of the "
+        "derivative is missing; use a bitmap with filter_type=bilinear, or split the surface along the steps",
+    )  # fmt: skip
+
+
+def check_emitter_steps(facts: SceneFacts) -> Iterator[Finding]:
+    """Lights whose emission ends in a step that is not the outline of a shape."""
+    for emitter in facts.emitters:
+        label = f"emitter '{emitter.name}' ({emitter.plugin})"
+        reshaped = {"cutoff_angle", "beam_width"} & set(emitter.radiance)
+        if emitter.hard_edge and (facts.geometry_moves or reshaped):
+            yield Finding(
+                UnsupportedWarning, emitter.name,
+                f"{label} has no soft rim: the derivative of the edge of its cone is missing; set "
+                "beam_width below cutoff_angle",
+            )  # fmt: skip
+        if emitter.plugin == "projector" and facts.geometry_moves:
+            yield Finding(
+                UnsupportedWarning, emitter.name,
+                f"{label} ends in a step at the frame of its picture, whose derivative is missing; fade the "
+                "picture to black at its border",
+            )  # fmt: skip
+        if emitter.plugin in ("sunsky", "timed_sunsky") and (facts.camera_moves or emitter.pose):
+            yield Finding(
+                UnsupportedWarning, emitter.name,
+                f"{label} has a sun disc whose rim is not sampled: it is missing where the disc is seen by "
+                "a turning camera or the sky itself turns; set sun_scale=0 and add a directional light",
+            )  # fmt: skip
+
+
+CHECKS = (
+    check_parameters,
+    check_variant,
+    check_media,
+    check_sensor,
+    check_shapes,
+    check_specular,
+    check_delta_weights,
+    check_extent,
+    check_surface_steps,
+    check_emitter_steps,
+)
+
+
+def warn_about_missing_terms(facts: SceneFacts, terms: Iterable[str], depth_limit: int, said: dict) -> None:
+    """Warn once if shadows or indirect visibility move and no term is there for them.
+
+    `terms` are the names in `terms.TERMS`; `said` remembers what has been warned about, per caller.
+    """
+    if not (facts.geometry_moves and facts.emitters):
+        return
+    missing = [f"'{name}' ({what})" for name, (depth, what) in BOUNDARY_TERMS.items()
+               if name not in terms and depth_limit >= depth]  # fmt: skip
+    if not missing:
+        return
+    moving = [f"shape '{s.name}'" for s in facts.shapes if s.moves]
+    moving += [f"emitter '{e.name}'" for e in facts.emitters if e.pose]
+    moving += [f"sensor '{facts.sensor.name}'"] if facts.camera_moves else []
+    message = (
+        f"{' and '.join(missing)} not in the derivative with respect to the motion of {', '.join(moving)}: these "
+        "boundary terms do not exist yet. psdr_jit.check_gradient (psdr gradient --check) tells how much that is; "
+        "with max_depth=1 it is nothing"
+    )
+    if message not in said.setdefault("missing terms", set()):
+        said["missing terms"].add(message)
+        warnings.warn(message, UnsupportedWarning, stacklevel=2)

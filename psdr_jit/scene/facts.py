@@ -1,0 +1,277 @@
+"""What is in a scene, what of it moves, and what carries a gradient: facts as plain data, no judgement.
+
+`checks` judges them, `plan` decides from them which terms exist.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
+from ..errors import UnsupportedError
+from .capabilities import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
+from .graph import (
+    SceneGraph,
+    blends_delta,
+    delta_lobes,
+    is_hard_edged,
+    is_unevenly_scaled,
+    jumping_textures,
+    non_finite_vertices,
+    plugin_name,
+    sees_frame,
+    weights_of_delta_lobes,
+)
+
+
+@dataclass(frozen=True)
+class ShapeFacts:
+    """One shape. Parameter tuples name those with gradients enabled; empty means: does not depend on θ."""
+
+    name: str
+    index: int  # in scene.shapes(); -1 inside a shape group
+    plugin: str  # as written in XML, for example "obj" or "sphere"
+    kind: str  # "mesh", "analytic" or "unsupported"
+    is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
+    faces: int  # 0 unless is_mesh
+    bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
+    smooth: bool  # shaded with interpolated vertex normals
+    has_texcoords: bool
+    is_emitter: bool
+    has_medium: bool
+    uneven_scale: bool  # a sphere or cylinder under a transform that Mitsuba does not model
+    bsdf: str  # plugin, as written in XML
+    bsdf_flags: int  # mi.BSDFFlags
+    delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
+    delta_weights: tuple[str, ...]  # enabled parameters that scale or steer a delta lobe, full names
+    delta_varies: bool  # such a parameter, enabled or not, varies over the surface
+    blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
+    jumps: tuple[str, ...]  # what is discontinuous inside the surface, "checkerboard 'floor'", ...
+    sees_frame: bool  # its BSDF depends on how the shading frame is turned about the normal
+    geometry: tuple[str, ...]  # parameters that move the surface
+    shading: tuple[str, ...]  # vertex normals, texture coordinates and attributes
+    material: tuple[str, ...]  # of the BSDF and its textures
+
+    @property
+    def moves(self) -> bool:
+        return bool(self.geometry)
+
+    @property
+    def opaque(self) -> bool:
+        """No light passes through the surface."""
+        return not self.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+
+
+@dataclass(frozen=True)
+class EmitterFacts:
+    """One light source. The pose of an area light is its shape's geometry and is not repeated here."""
+
+    name: str
+    plugin: str  # as written in XML, for example "area" or "envmap"
+    shape: int  # index in SceneFacts.shapes, -1 if it has none
+    delta: bool  # a point or a direction: reached by emitter sampling only
+    infinite: bool
+    varies: bool  # what is seen of it directly differs from point to point or with the direction
+    hard_edge: bool  # a spot whose cone has no soft rim
+    jumps: tuple[str, ...]  # discontinuous textures
+    pose: tuple[str, ...]  # enabled parameters that move it
+    radiance: tuple[str, ...]  # all other enabled parameters
+
+
+@dataclass(frozen=True)
+class SensorFacts:
+    """The sensor that is rendered."""
+
+    name: str
+    plugin: str  # as written in XML, for example "perspective"
+    has_medium: bool
+    shutter_open_time: float  # [s]
+    pose: tuple[str, ...]  # enabled parameters: pose and intrinsics, neither film nor sampler
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """Everything the plan and the checks need to know about one scene and one sensor."""
+
+    variant: str
+    polarized: bool
+    shapes: tuple[ShapeFacts, ...]
+    emitters: tuple[EmitterFacts, ...]
+    sensor: SensorFacts
+    enabled: tuple[str, ...]  # all parameters with gradients enabled, as `mi.traverse(scene)` names them
+    extent: float  # diagonal of the scene's bounding box [scene units], 0 without shapes
+    reach: float  # largest coordinate of that box [scene units]
+    still: str = ""  # why nothing counts as enabled though gradients are
+
+    @property
+    def anything_enabled(self) -> bool:
+        return bool(self.enabled)
+
+    @property
+    def camera_moves(self) -> bool:
+        return bool(self.sensor.pose)
+
+    @property
+    def shapes_move(self) -> bool:
+        return any(shape.moves for shape in self.shapes)
+
+    @property
+    def emitters_move(self) -> bool:
+        """A light without a shape changes its pose. A moving area light counts as a moving shape."""
+        return any(emitter.pose for emitter in self.emitters)
+
+    @property
+    def geometry_moves(self) -> bool:
+        """Discontinuities may move: a shape, a light's pose, or the camera depends on θ."""
+        return self.shapes_move or self.emitters_move or self.camera_moves
+
+    @property
+    def has_delta_emitters(self) -> bool:
+        return any(emitter.delta for emitter in self.emitters)
+
+    @property
+    def has_infinite_emitters(self) -> bool:
+        return any(emitter.infinite for emitter in self.emitters)
+
+    @property
+    def has_area_emitters(self) -> bool:
+        return any(emitter.shape >= 0 for emitter in self.emitters)
+
+    def __str__(self) -> str:
+        def listed(names: tuple[str, ...]) -> str:
+            return ", ".join(names) or "-"
+
+        lines = [f"sensor {self.sensor.name} ({self.sensor.plugin}): enabled {listed(self.sensor.pose)}"]
+        for s in self.shapes:
+            lines.append(
+                f"shape {s.name} ({s.plugin}, {s.kind}, {s.faces} faces, {s.bsdf}): geometry "
+                f"{listed(s.geometry)}; shading {listed(s.shading)}; material {listed(s.material)}"
+            )
+        for e in self.emitters:
+            lines.append(
+                f"emitter {e.name} ({e.plugin}): pose {listed(e.pose)}; radiance {listed(e.radiance)}"
+            )
+        return "\n".join(lines)
+
+
+def analyse(
+    scene: mi.Scene, sensor: mi.Sensor | int = 0, counts: Callable[[object], bool] = lambda value: True
+) -> SceneFacts:
+    """Collect the facts about `scene` as seen by `sensor` (the sensor itself, or its number).
+
+    `counts(value)`: whether a parameter value with gradients enabled counts as such. Gradients that are merely
+    suspended (`dr.suspend_grad`) are enabled. Costs milliseconds and one synchronisation, so it can be repeated
+    whenever parameters change.
+    """
+    if not dr.is_diff_v(mi.Float):
+        raise UnsupportedError(
+            f"variant '{mi.variant()}' does not track derivatives; use mi.set_variant('llvm_ad_rgb')"
+        )
+    with dr.resume_grad():
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        graph = SceneGraph(scene, sensor, counts)
+        scene_shapes = list(scene.shapes())
+        shapes = scene_shapes + [s for s in graph.shapes_in_groups() if s not in scene_shapes]
+        bad_vertices = non_finite_vertices(shapes)
+        return SceneFacts(
+            variant=mi.variant(),
+            polarized=mi.is_polarized,
+            shapes=tuple(
+                _shape_facts(graph, shape, i if i < len(scene_shapes) else -1, bad_vertices[i])
+                for i, shape in enumerate(shapes)
+            ),
+            emitters=tuple(
+                _emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
+            ),
+            sensor=_sensor_facts(graph, sensor),
+            enabled=graph.enabled_names(),
+            extent=_extent(scene),
+            reach=max(map(abs, [*scene.bbox().min, *scene.bbox().max])) if scene.bbox().valid() else 0.0,
+        )
+
+
+def _extent(scene: mi.Scene) -> float:
+    box = scene.bbox()
+    return math.dist(box.max, box.min) if box.valid() else 0.0
+
+
+def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: int) -> ShapeFacts:
+    others = (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium, mi.Shape)  # what is left are texture attributes
+    is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
+    enabled = graph.enabled_of(shape)
+    shading = tuple(name for name in enabled if _only_shades(name))
+    delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
+    if plugin in UNSUPPORTED_SHAPES:
+        kind = "unsupported"
+    elif plugin in ANALYTIC_SHAPES:
+        kind = "analytic"
+    else:  # a shape plugin of somebody else is fine as long as it is made of triangles
+        kind = "mesh" if is_mesh else "unsupported"
+    return ShapeFacts(
+        name=graph.name(shape, index),
+        index=index,
+        plugin=plugin,
+        kind=kind,
+        is_mesh=is_mesh,
+        faces=shape.face_count() if is_mesh else 0,
+        bad_vertices=bad_vertices,
+        smooth=is_mesh and kind == "mesh" and shape.has_vertex_normals() and not shape.has_face_normals(),
+        has_texcoords=is_mesh and shape.has_vertex_texcoords(),
+        is_emitter=shape.is_emitter(),
+        has_medium=shape.is_medium_transition(),
+        uneven_scale=is_unevenly_scaled(graph, shape, plugin),
+        bsdf=plugin_name(bsdf) if bsdf is not None else "none",
+        bsdf_flags=bsdf.flags() if bsdf is not None else 0,
+        delta_lobes=delta_lobes(graph, bsdf),
+        delta_weights=delta_weights,
+        delta_varies=delta_varies,
+        blends_delta=blends_delta(graph, bsdf),
+        jumps=jumping_textures(graph, bsdf),
+        sees_frame=sees_frame(graph, bsdf),
+        geometry=tuple(name for name in enabled if name not in shading),
+        shading=shading + graph.enabled_below(shape, skip=others),
+        material=graph.enabled_from(bsdf),
+    )
+
+
+def _only_shades(parameter: str) -> bool:
+    """Whether a mesh parameter leaves the surface where it is."""
+    attribute = parameter.startswith(("vertex_", "face_")) and parameter != VERTEX_POSITIONS
+    return attribute or parameter in (VERTEX_NORMALS, VERTEX_TEXCOORDS)
+
+
+def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: list) -> EmitterFacts:
+    enabled = graph.enabled_of(emitter)
+    pose = tuple(name for name in enabled if name in POSE_PARAMETERS)
+    flags = emitter.flags()
+    owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
+    name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
+    return EmitterFacts(
+        name=name,
+        plugin=plugin_name(emitter),
+        shape=owners[0] if owners else -1,
+        delta=bool(flags & int(mi.EmitterFlags.Delta)),
+        infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
+        varies=plugin_name(emitter) not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
+        hard_edge=is_hard_edged(graph, emitter),
+        jumps=jumping_textures(graph, emitter),
+        pose=pose,
+        radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
+    )
+
+
+def _sensor_facts(graph: SceneGraph, sensor: mi.Sensor) -> SensorFacts:
+    return SensorFacts(
+        name=graph.name(sensor, 0),
+        plugin=plugin_name(sensor),
+        has_medium=sensor.get_medium() is not None,
+        shutter_open_time=float(sensor.shutter_open_time()),
+        pose=graph.enabled_of(sensor)
+        + graph.enabled_below(sensor, skip=(mi.Film, mi.Sampler, mi.Medium, mi.Shape)),
+    )
+

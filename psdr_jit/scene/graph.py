@@ -1,0 +1,283 @@
+"""Finding out what a loaded scene does not say by itself: who owns what, which textures jump, what is hard.
+
+Mitsuba keeps no record of the properties a plugin was made from. What traversal shows is read from there; the
+rest is probed on the object, without tracing a ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import mesh_positions
+from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
+from .params import parameter_value
+
+HARD_EDGE = 1e-3
+"""A spot whose rim is thinner than this fraction of its cone counts as a step: no sampling resolves it."""
+
+UNEVEN_SCALE = 1e-4
+"""Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
+
+
+DELTA_KINDS = ("Null", "DeltaReflection", "DeltaTransmission", "Delta1D")
+"""The lobes (names in `mi.BSDFFlags`) that have no value to evaluate, only samples."""
+
+
+class SceneGraph:
+    """The objects of a scene and a sensor, with those of their parameters that have gradients enabled.
+
+    `mi.traverse` visits a shared object once and under one name; here every owner finds it.
+    """
+
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, counts: Callable[[object], bool]):
+        """`counts(value)`: does this parameter value, whose gradients are enabled, count as such?"""
+        self._counts = counts
+        params = mi.traverse(scene)
+        self._nodes = list(params.hierarchy)  # keeps the nodes, and with them their ids, alive
+        self._values: dict[int, dict[str, object]] = {}  # id(node) -> parameter -> value
+        self._enabled: dict[str, int] = {}  # traversed name -> id(node)
+        self._collect(params, "")
+        if sensor not in params.hierarchy:  # loaded on its own, as multi-view loops do
+            params = mi.traverse(sensor)
+            self._nodes += params.hierarchy
+            self._collect(params, "sensor.")
+        self._children = {id(node): child_objects(node) for node in self._nodes}
+
+    def _collect(self, params, prefix: str) -> None:
+        for name, (_, _, node, _) in params.properties.items():
+            value = parameter_value(params, name)
+            self._values.setdefault(id(node), {})[_last(name)] = value
+            if _grad_enabled(value) and self._counts(value):
+                self._enabled[prefix + name] = id(node)
+
+    def enabled_names(self) -> tuple[str, ...]:
+        return tuple(self._enabled)
+
+    def value(self, node: mi.Object, parameter: str):
+        """The current value of one of the node's own parameters, or None if it has no such parameter."""
+        return self._values.get(id(node), {}).get(parameter)
+
+    def enabled_of(self, node: mi.Object) -> tuple[str, ...]:
+        """The node's own enabled parameters, by their last name."""
+        return tuple(_last(name) for name, owner in self._enabled.items() if owner == id(node))
+
+    def enabled_full(self, node: mi.Object) -> tuple[str, ...]:
+        """The node's own enabled parameters, by their full names."""
+        return self._enabled_in([node])
+
+    def enabled_below(self, node: mi.Object | None, skip: tuple[type, ...] = ()) -> tuple[str, ...]:
+        """Enabled parameters of everything that `node` refers to, by their full names."""
+        return self._enabled_in(self.walk(node, skip)[1:])
+
+    def enabled_from(self, node: mi.Object | None) -> tuple[str, ...]:
+        """Enabled parameters of `node` and everything that it refers to, by their full names."""
+        return self._enabled_in(self.walk(node))
+
+    def _enabled_in(self, nodes: list[mi.Object]) -> tuple[str, ...]:
+        ids = {id(node) for node in nodes}
+        return tuple(name for name, owner in self._enabled.items() if owner in ids)
+
+    def walk(self, node: mi.Object | None, skip: tuple[type, ...] = ()) -> list[mi.Object]:
+        """`node` and then all it refers to, each object once, without entering those of types `skip`."""
+        found, todo = {}, [] if node is None else [node]
+        while todo:
+            node = todo.pop()
+            if id(node) not in found:
+                found[id(node)] = node
+                todo += [child for child in self._children_of(node) if not isinstance(child, skip)]
+        return list(found.values())
+
+    def _children_of(self, node: mi.Object) -> list[mi.Object]:
+        known = self._children.get(id(node))
+        return child_objects(node) if known is None else known
+
+    def shapes_in_groups(self) -> list[mi.Shape]:
+        """The shapes that are visible through instances only."""
+        groups = [n for n in self._nodes if plugin_name(n) == "shapegroup"]
+        return [n for group in groups for n in self.walk(group) if isinstance(n, mi.Shape) and n is not group]
+
+    def name(self, node: mi.Object, index: int) -> str:
+        """The id given in the scene file, or the plugin and a number."""
+        known = node.id()
+        return known if known and not known.startswith("_unnamed_") else f"{plugin_name(node)} #{index}"
+
+
+def child_objects(node: mi.Object) -> list[mi.Object]:
+    """The objects that `node` refers to directly, in the order in which it names them."""
+    return [child for _, child in _named_children(node)]
+
+
+def _named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
+    callback = _children_callback()()
+    node.traverse(callback)
+    return callback.found
+
+
+@cache
+def _children_callback() -> type:
+    """The traversal callback, made when first needed: its base exists with a variant only."""
+
+    class Children(mi.TraversalCallback):
+        def __init__(self):
+            super().__init__()
+            self.found = []
+
+        def put(self, name, value, flags, cpptype=None):
+            if isinstance(value, mi.Object):
+                self.found.append((name, value))
+
+    return Children
+
+
+def _last(name: str) -> str:
+    return name.rsplit(".", 1)[-1]
+
+
+def _grad_enabled(value) -> bool:
+    return value is not None and not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
+
+
+def plugin_name(node: mi.Object) -> str:
+    """The name that creates this object in a scene file; the C++ class name if it is not known."""
+    known = node.class_name().split("[")[0]  # "BitmapTextureImpl[float32]"
+    return PLUGIN_NAMES.get(known, known)
+
+
+def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
+    """The perfectly specular and pass-through lobes of a BSDF, each with the nested plugin it comes from."""
+    lobes = {}
+    for node in graph.walk(bsdf):
+        if not isinstance(node, mi.BSDF):
+            continue
+        nested = [child for child in graph.walk(node)[1:] if isinstance(child, mi.BSDF)]
+        for kind in DELTA_KINDS:
+            bit = int(getattr(mi.BSDFFlags, kind))
+            # an adapter such as "twosided" repeats the flags of what it wraps: blame the innermost plugin
+            if node.flags() & bit and not any(child.flags() & bit for child in nested):
+                lobes[f"{plugin_name(node)}: {kind}"] = None
+    return tuple(lobes)
+
+
+def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
+    """Enabled parameters that scale or steer a delta lobe (full names), and whether one varies over the surface.
+
+    A BSDF that only wraps others (`mask`, `blendbsdf`, `normalmap`) counts when one of those has a delta lobe.
+    """
+    enabled, varies = {}, False
+    for node in graph.walk(bsdf):
+        if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
+            continue
+        own = [
+            child
+            for name, child in _named_children(node)
+            if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
+        ]
+        for child in own:
+            enabled |= dict.fromkeys(graph.enabled_from(child))
+            varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
+        enabled |= dict.fromkeys(graph.enabled_full(node))
+    return tuple(enabled), varies
+
+
+def blends_delta(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a `blendbsdf` mixes a delta lobe with a smooth one."""
+    blends = [node for node in graph.walk(bsdf) if plugin_name(node) == "blendbsdf"]
+    return any(_has_delta_lobe(node) and node.flags() & int(mi.BSDFFlags.Smooth) for node in blends)
+
+
+def _has_delta_lobe(bsdf: mi.BSDF) -> bool:
+    if plugin_name(bsdf) == "hair":  # says that it has a null lobe, and never samples it
+        return False
+    return any(bsdf.flags() & int(getattr(mi.BSDFFlags, kind)) for kind in DELTA_KINDS)
+
+
+def jumping_textures(graph: SceneGraph, owner: mi.Object | None) -> tuple[str, ...]:
+    """Textures and adapters below `owner` whose value steps from one surface point to the next."""
+    found = {}
+    for node in graph.walk(owner, skip=(mi.Shape,)):
+        plugin = plugin_name(node)
+        stepped = isinstance(node, mi.Texture) and _is_piecewise_constant(node, plugin)
+        if stepped or plugin in JUMPING_PLUGINS:
+            found[f"{plugin} '{node.id()}'" if node.id() else plugin] = None
+    return tuple(found)
+
+
+def sees_frame(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a BSDF depends on how the shading frame is turned about the normal: brushed metal, normal maps."""
+    known = [node for node in graph.walk(bsdf, skip=(mi.Shape,)) if isinstance(node, mi.BSDF)]
+    turned = any(node.flags() & int(mi.BSDFFlags.Anisotropic) for node in known)
+    return turned or any(plugin_name(node) not in FRAME_FREE_PLUGINS for node in known)
+
+
+def _is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
+    """Whether a texture varies over the surface and yet has no derivative with respect to the position.
+
+    That is what `filter_type=nearest` means, which neither traversal nor `to_string` reveals. The value is
+    recorded, never evaluated: whether it is attached to the position is known without a kernel launch.
+    """
+    if plugin == "mesh_attribute":
+        return 'name = "face_' in str(texture)
+    if not texture.is_spatially_varying():
+        return False
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.uv, si.p = mi.Point2f(0.3, 0.4), mi.Point3f(0.3, 0.4, 0.5)
+    dr.enable_grad(si.uv, si.p)
+    for lookup in (texture.eval, texture.eval_3, texture.eval_1):
+        try:
+            return not dr.grad_enabled(lookup(si))
+        except RuntimeError:  # raw data has no spectral value, and coloured data no scalar one
+            continue
+    return False
+
+
+def is_hard_edged(graph: SceneGraph, emitter: mi.Emitter) -> bool:
+    """Whether a spot light's intensity drops to zero in a step, at the rim of its cone."""
+    cutoff, beam = (_host(graph.value(emitter, name)) for name in ("cutoff_angle", "beam_width"))
+    if cutoff is None or beam is None:
+        return False
+    return bool(np.any(cutoff - beam <= HARD_EDGE * cutoff))
+
+
+def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
+    """Whether a sphere is stretched or sheared, or the cross-section of a cylinder is."""
+    if plugin not in ("sphere", "cylinder"):
+        return False
+    matrix = _host(graph.value(shape, "to_world").matrix)
+    if matrix is None:
+        return False
+    axes = matrix.reshape(4, 4)[:3, :3]
+    length = np.linalg.norm(axes, axis=0)
+    round_axes = length if plugin == "sphere" else length[:2]
+    gram = (axes / np.maximum(length, np.finfo(np.float32).tiny)).T @ axes / length.max()
+    sheared = np.abs(gram - np.diag(np.diag(gram))).max() > UNEVEN_SCALE
+    return bool(sheared or np.ptp(round_axes) > UNEVEN_SCALE * round_axes.max())
+
+
+def non_finite_vertices(shapes: list[mi.Shape]) -> list[int]:
+    """Number of vertices of each shape with a NaN or infinite coordinate; one synchronisation in all."""
+    meshes = [i for i, shape in enumerate(shapes) if shape.is_mesh() and shape.vertex_count() > 0]
+    result = [0] * len(shapes)
+    if not meshes or dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read while freezing
+        return result
+    counts = [dr.count(~_all_finite(mesh_positions(shapes[i]))) for i in meshes]
+    dr.eval(counts)
+    for i, count in zip(meshes, np.array(dr.concat(counts)), strict=True):
+        result[i] = int(count)
+    return result
+
+
+def _all_finite(p: mi.Point3f) -> mi.Bool:
+    p = dr.detach(p)
+    return dr.isfinite(p.x) & dr.isfinite(p.y) & dr.isfinite(p.z)
+
+
+def _host(value) -> np.ndarray | None:
+    """`value` on the host, or None while a function is being frozen: its values are not available then."""
+    if value is None or dr.flag(dr.JitFlag.FreezingScope):
+        return None
+    return np.array(dr.detach(value), dtype=np.float64).squeeze()

@@ -1,0 +1,104 @@
+"""Intersection curves of meshes and balls against closed forms: lengths, planes, and what is not an intersection."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psdr_jit.edges import intersections as cut
+from psdr_jit.edges.topology import build_edge_topology
+
+CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+CUBE_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
+                       [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+SQUARE = np.array([[-3, 0, -3], [3, 0, -3], [3, 0, 3], [-3, 0, 3]], float)
+SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def mesh(positions: np.ndarray, faces: np.ndarray) -> cut.TriangleMesh:
+    topology = build_edge_topology(positions, faces)
+    edges = np.stack([topology.v0, topology.v1], 1)
+    return cut.TriangleMesh(positions, faces, edges, np.stack([topology.f0, topology.f1], 1))
+
+
+def rotation(rng) -> np.ndarray:
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+def length(found) -> float:
+    return np.linalg.norm(found.end - found.start, axis=1).sum()
+
+
+def test_cube_in_a_floor():
+    """An upright cube cuts a plane in a square, wherever the plane's diagonal runs."""
+    found = cut.mesh_mesh(mesh(CUBE * 0.5 + [0.1, 0.2, -0.3], CUBE_FACES), mesh(SQUARE, SQUARE_FACES))
+    assert length(found) == pytest.approx(4, abs=1e-9)
+    assert np.allclose(found.start[:, 1], 0) and np.allclose(found.end[:, 1], 0)
+    assert np.allclose(np.abs(found.start - [0.1, 0, -0.3]).max(1), 0.5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rotated_cube(seed):
+    """Perimeter of the convex hull of the section, and both surfaces contain every point."""
+    rng = np.random.default_rng(seed)
+    turned = CUBE @ rotation(rng).T * 0.7 + rng.normal(size=3) * 0.2
+    a = mesh(turned, CUBE_FACES)
+    found = cut.mesh_mesh(a, mesh(SQUARE, SQUARE_FACES))
+    points = np.concatenate([found.start, found.end])
+    centre = points.mean(0)
+    angle = np.arctan2(points[:, 2] - centre[2], points[:, 0] - centre[0])
+    hull = points[np.argsort(angle)]
+    assert length(found) == pytest.approx(np.linalg.norm(hull - np.roll(hull, 1, 0), axis=1).sum(), rel=1e-6)
+    for face, x in ((found.face_a, found.start), (found.face_a, found.end)):
+        corners = turned[CUBE_FACES[face]]
+        weights = cut.barycentric(x, corners)
+        assert weights.min() > -1e-6
+        assert np.allclose(np.einsum("ij,ijk->ik", weights, corners), x, atol=1e-9)
+
+
+def test_swapping_the_meshes_changes_nothing():
+    a, b = mesh(CUBE * 0.5 + [0.1, 0.2, 0], CUBE_FACES), mesh(SQUARE, SQUARE_FACES)
+    there, back = cut.mesh_mesh(a, b), cut.mesh_mesh(b, a)
+    assert length(there) == pytest.approx(length(back))
+    assert sorted(zip(there.face_a, there.face_b, strict=True)) == sorted(zip(back.face_b, back.face_a, strict=True))
+
+
+@pytest.mark.parametrize("height", [0.5, 0.5 + 1e-7, 0.5 - 1e-7, 0.6, 3.0])
+def test_resting_and_floating_do_not_cut(height):
+    found = cut.mesh_mesh(mesh(CUBE * 0.5 + [0.1, height, 0], CUBE_FACES), mesh(SQUARE, SQUARE_FACES))
+    assert len(found.face_a) == 0
+
+
+def test_two_cubes():
+    """Two equal upright cubes, one shifted along the diagonal: their surfaces meet in a closed hexagon of edges 1."""
+    found = cut.mesh_mesh(mesh(CUBE, CUBE_FACES), mesh(CUBE + 1.0, CUBE_FACES))
+    assert length(found) == pytest.approx(6, abs=1e-9)
+
+
+def test_too_dense(monkeypatch):
+    monkeypatch.setattr(cut, "MAX_TESTS", 10)
+    with pytest.raises(cut.TooManyPairs):
+        cut.mesh_mesh(mesh(CUBE, CUBE_FACES), mesh(CUBE + 0.5, CUBE_FACES))
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3, -0.6])
+def test_ball_in_a_floor(height):
+    found = cut.ball_mesh(np.array([0.2, height, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
+    size = np.sqrt(0.8**2 - height**2)
+    half = np.linalg.norm(found.end - found.start, axis=1) / 2 / found.radius
+    assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(2 * np.pi * size, rel=1e-9)
+    assert np.allclose(found.radius, size) and np.allclose(found.centre, [0.2, 0, 0.1])
+    assert np.allclose(np.linalg.norm(found.start - found.centre, axis=1), size)
+
+
+def test_ball_over_the_border_of_a_floor():
+    """Half of the circle lies beside the plane."""
+    found = cut.ball_mesh(np.array([3.0, 0, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
+    half = np.linalg.norm(found.end - found.start, axis=1) / 2 / found.radius
+    assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(np.pi * 0.8, rel=1e-9)
+    assert found.start[:, 0].max() <= 3 + 1e-9
+
+
+def test_touching_ball():
+    assert len(cut.ball_mesh(np.array([0, 0.8, 0]), 0.8, mesh(SQUARE, SQUARE_FACES), 64).face) == 0
