@@ -7,10 +7,12 @@ import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
 from psdr_jit.core import film as films
-from psdr_jit.core.counters import Rejected
-from psdr_jit.driver.prepare import Call, Prepared, prepare
+from psdr_jit.core.counters import Counters
+from psdr_jit.core.memory import Memory
+from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
+from psdr_jit.plan.call import Call
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.batch_sensor import parts_of, share, side_by_side, splits
 from psdr_jit.scene.io import find_sensor
@@ -22,9 +24,10 @@ class TermIntegrator(ADIntegrator):
     def __init__(self, props):
         self.options = Options.from_properties(props)
         super().__init__(props)
-        self.cache: dict = {}
+        self.memory = Memory()
         self.plan: Plan | None = None  # of the latest derivative
-        self.stats = {"rejected": Rejected(), "grazing": Rejected()}  # paths that were dropped, or cut short
+        self.counters = Counters()
+        self.stats = {"rejected": self.counters.rejected, "grazing": self.counters.grazing}  # dropped, or cut short
         self._path = mi.load_dict(
             {
                 "type": "path",
@@ -44,8 +47,7 @@ class TermIntegrator(ADIntegrator):
     def call(self, scene, sensor, seed, spp, mode="forward") -> Call:
         """A render call of this integrator as data."""
         sensor = find_sensor(scene, sensor)
-        stats = self.stats
-        return Call(self, scene, sensor, self.options, self.cache, stats["rejected"], stats["grazing"], seed, spp, mode)
+        return Call(self, scene, sensor, self.options, self.memory, self.counters, seed, spp, mode)
 
     def _prepared(self, scene, sensor, seed, spp, mode) -> Prepared:
         prepared = prepare(self.call(scene, sensor, seed, spp, mode))

@@ -20,6 +20,11 @@ PLANS = ("lean", "full")
 DIRECTIONS = ("any", "known")
 
 
+#: The options that hold a term's samples per pixel, and which of them follows another one where it is not set.
+BUDGETS = ("sppc", "sppp", "sppi", "sppd")
+FOLLOWS = {"sppd": "sppi"}
+
+
 @dataclass(frozen=True)
 class Options:
     """How far to trace and how many samples to spend.
@@ -38,7 +43,7 @@ class Options:
     sppd: int | None = None  # samples per pixel, direct boundary term; overrides sppi
     record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes
     form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
-    plan: str = "lean"  # one of PLANS
+    plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS
 
     def __post_init__(self):
@@ -50,12 +55,12 @@ class Options:
             raise OptionError(
                 f"rr_depth = {self.rr_depth}: use a depth >= 1 (a large one switches roulette off)"
             )
-        for name in ("sppc", "sppp", "sppi", "sppd"):
+        for name in BUDGETS:
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
         for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS)):
-            if getattr(self, name) not in words:
+            if getattr(self, name) not in words and not (name == "plan" and self.plan_is_given):
                 raise OptionError(f"{name} = {getattr(self, name)!r}: use {', '.join(words[:-1])} or {words[-1]}")
         if self.record_mib < 16:
             raise OptionError(f"record_mib = {self.record_mib}: at least 16 MiB are needed")
@@ -84,14 +89,19 @@ class Options:
         return Options(**{f.name: props.get(f.name, f.default) for f in fields(Options)})
 
     def budget(self, name: str) -> int | None:
-        """Samples per pixel under the property `name`; `sppd` that is not set follows `sppi`."""
+        """Samples per pixel under the property `name`, or under the one that it follows if it is not set."""
         value = getattr(self, name)
-        return self.sppi if value is None and name == "sppd" else value
+        return getattr(self, FOLLOWS[name]) if value is None and name in FOLLOWS else value
+
+    @property
+    def plan_is_given(self) -> bool:
+        """Is `plan` the text of a plan, `Plan.to_json`, rather than a way to make one?"""
+        return self.plan.lstrip().startswith("{")
 
     @property
     def budgets_set(self) -> bool:
         """Does any term have a budget of its own?"""
-        return any(getattr(self, name) is not None for name in ("sppc", "sppp", "sppi", "sppd"))
+        return any(getattr(self, name) is not None for name in BUDGETS)
 
     @property
     def depth_limit(self) -> int:

@@ -79,7 +79,7 @@ def test_no_circles_inside_of_a_room(name):
 
 
 def test_the_import_scan_sees_imports():
-    assert {"boundary.primary", "interior.term", "plan.job"} <= imports("driver.terms", modules()["driver.terms"])
+    assert {"boundary.primary", "interior.term", "plan.term"} <= imports("driver.terms", modules()["driver.terms"])
     assert "core.sensor_frame" in imports("boundary.primary", modules()["boundary.primary"])
     assert "setup.drjit_libraries" in imports("cli.setup_env", modules()["cli.setup_env"])  # inside of a function
 

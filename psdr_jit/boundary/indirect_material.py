@@ -20,12 +20,13 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.streams import Stream
+from ..edges.location import EdgeLocation
 from ..edges.table import EdgeTable, background, compact, shared_frame
 from ..plan.job import Job
 from ..sampling.directions import background_wedges, wedge_measure
 from ..sampling.relevance import SecondaryEdges, secondary_edges
 from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
-from .segment_motion import BoundarySamples, motion_of
+from .segment_motion import BoundarySamples
 from .sensor_subpath import SubpathRecords, subpaths
 
 #: Share of a resting edge's directions in which movers are behind it; otherwise they are in front.
@@ -75,12 +76,6 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
     return dr.select(needed, L, 0)
 
 
-def _source_motion(b: Background) -> mi.Float:
-    """Attached −ρ s·v_S: of value 0."""
-    moved = motion_of(b.source, -b.ratio * b.view.side)
-    return moved - dr.detach(moved)
-
-
 def prepared(job: Job) -> BoundarySamples | None:
     """Sampled, traced and recorded; None if there is nothing to sample."""
     frame = shared_frame(job)
@@ -105,19 +100,14 @@ def prepared(job: Job) -> BoundarySamples | None:
         -(1 - b.ratio) * v.side,
         longest_subpath(job),
     )
-    value = job.rejected.keep_finite(records.data.W * _radiance(job, b, records))
+    value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)
     return BoundarySamples(
         table=edges.table,
-        row=v.row,
-        t=v.t,
-        local=v.local,
+        at=EdgeLocation(v.row, v.t, v.x, v.local, v.scale),
         n=v.side,
         wavelengths=v.wavelengths,
         records=records,
         value=value,
-        source_motion=lambda: _source_motion(b),
-        x=v.x,
-        source=b.source,
-        source_covector=-b.ratio * v.side,
+        source_motion=lambda moving: -b.ratio * dr.dot(b.view.side, moving.of_surface(b.source)),
     )

@@ -16,6 +16,7 @@ The value of the estimator is 0, only its derivative is not. Both sides are trac
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -26,21 +27,25 @@ from ..core.ad import backpropagate, tangents
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import SensorFrame
 from ..core.streams import Stream, stream_seed
+from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON, EdgePoint, curve_row_point, segment_point
 from ..edges.table import (
     EdgeTable,
     compact,
-    edge_motion,
     edge_samples,
-    row_moves,
     scene_edges,
     shared_frame,
     sides,
 )
+from ..options import Options
 from ..paths.walk import NoSink, skip_emitters, walk
 from ..plan.job import Job
+from ..plan.plan import Geometry
+from ..plan.reasons import steps_rest
+from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling import film_weights
 from ..sampling.distribution import EdgeDistribution, distribution_of, pmf, sample_edge, stratified
+from ..scene.facts import SceneFacts
 
 
 @dataclass(frozen=True)
@@ -155,11 +160,8 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
     return L, alpha, wavelengths
 
 
-def contribution(job: Job) -> mi.TensorXf | None:
-    """The primary boundary as an image of value 0 that carries its derivative; None if no edge can move.
-
-    In a trial the image is the derivative itself.
-    """
+def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None]) -> mi.TensorXf | None:
+    """`finish(image)`, the boundary as an image of value 0 that carries its derivative; None if there is nothing."""
     frame = shared_frame(job)
     with dr.suspend_grad():
         edges = primary_edges(job, frame)
@@ -170,40 +172,56 @@ def contribution(job: Job) -> mi.TensorXf | None:
             return None
         L, alpha, wavelengths = _both_sides(job, frame, edges, sample)
         even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
-        ΔL = job.rejected.keep_finite(dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1))
+        step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
+        ΔL = job.call.counters.rejected.keep_finite(step)
         Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
         wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
         seen = _edge_point(edges, sample, frame)
         point = seen.point
         scale = point.speed / point.view.J_px * sample.inv_pdf
 
-    if job.trial is not None:
-        moves = dr.select(row_moves(edges.table, sample.row), 1.0, 0.0) - float(job.trial.camera)
-        motion = dr.dot(point.side, job.trial.velocity(point.x)) * moves * scale
-        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
-    with dr.resume_grad():
-        relative = edge_motion(edges.table, sample.row, sample.t, seen.local)
+    with job.motion.attached() as moving:
+        at = EdgeLocation(sample.row, sample.t, point.x, seen.local, seen.scale)
+        relative = moving.of_edge(edges.table, at)
         if job.facts.camera_moves:
-            ray, _ = job.sensor.sample_ray(0, 0.5, point.view.film, sample.aperture)
-            u = ray.o + ray.d * dr.detach(dr.dot(point.x - ray.o, ray.d))
-            relative -= u - dr.detach(u)
+            relative -= moving.of_camera(point.view.film, sample.aperture, point.x)
         motion = dr.dot(point.side, relative) * scale
-        return films.develop_boundary(job.film, point.view.p, ΔL * motion, Δα * motion, wavelengths, point.valid)
+        p = point.view.p
+        return finish(films.develop_boundary(job.film, p, ΔL * motion, Δα * motion, wavelengths, point.valid))
 
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the primary boundary along the tangents set on the scene's parameters. Detached."""
-    with dr.resume_grad():
-        image = contribution(job)
-        if image is None:
-            return films.black(job.film)
-        return tangents(image) if job.trial is None else image
+    image = _contribution(job, tangents)
+    return films.black(job.film) if image is None else image
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the primary boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    with dr.resume_grad():
-        image = contribution(job)
-        if image is None:
-            return
-        backpropagate(image, grad_in)
+    _contribution(job, lambda image: backpropagate(image, grad_in))
+
+
+def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
+    """Outlines move as soon as a shape or the camera does."""
+    if steps_rest(facts):
+        return False, steps_rest(facts)
+    if not (facts.shapes_move or facts.camera_moves):
+        return False, "only lights without a shape move: every outline stays where it is on the film"
+    return True, "outlines move over the film"
+
+
+def cost(form: str, sky: bool) -> float:
+    """Time of a path relative to one of the interior term (medians over the shipped scenes, two cores)."""
+    return 1.1
+
+
+TERM = Term(
+    name="primary",
+    budget="sppp",
+    streams=(Stream.PRIMARY_EDGE, Stream.PRIMARY_RADIANCE),
+    needed=needed,
+    cost=cost,
+    forward=forward,
+    backward=backward,
+    edges=EdgeSampling(edge_weights, "the others rest, are coplanar, turn away or leave the film"),
+)

@@ -1,12 +1,14 @@
-"""Non-finite samples are dropped, and counted: a NaN masked in silence would be a defect."""
+"""What is dropped is counted: a NaN masked in silence would be a defect."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 
 
-class Rejected:
+class Counter:
     """Counter of dropped samples. Lives on an integrator, reads as an `int`, costs no synchronisation until then."""
 
     def __init__(self):
@@ -35,3 +37,11 @@ class Rejected:
 
     def clear(self) -> None:
         self._count = mi.UInt32(0)
+
+
+@dataclass(frozen=True)
+class Counters:
+    """Of one integrator, over all its calls."""
+
+    rejected: Counter = field(default_factory=Counter)  # samples that were not finite
+    grazing: Counter = field(default_factory=Counter)  # paths that end where they meet a surface edge-on

@@ -153,8 +153,8 @@ def _samplers(scene: Any, param: Perturbation, integrator: Any, sensor: int, spp
     samplers = {t: DerivativeSampler(param, integrator_specs.build_term(spec, t), sensor, spp, groups)
                 for t in terms}
     for sampler in samplers.values():
-        if hasattr(whole, "cache"):
-            sampler.integrator.cache = whole.cache      # edge tables, and what has been warned about
+        if hasattr(whole, "memory"):
+            sampler.integrator.memory = whole.memory      # edge tables, and what has been warned about
     return samplers, whole, spec
 
 

@@ -14,7 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
+from psdr_jit.options import FOLLOWS
+from psdr_jit.plan.plan import Plan
 
 DEFAULT_INTEGRATOR = "psdr_path"
 
@@ -69,8 +72,6 @@ def integrator_spec(scene: Any, integrator: Mapping[str, Any] | str | None = Non
 def term_table(plugin: str) -> tuple[tuple[str, str], ...]:
     """(term, property with its sample budget, 0 for off) of each term of `plugin`; empty: not separable."""
     if plugin == DEFAULT_INTEGRATOR:
-        from psdr_jit.driver.terms import TERMS
-
         return tuple((term.name, term.budget) for term in TERMS)
     return PROJECTIVE_TERMS if plugin in ("prb_projective", "direct_projective") else ()
 
@@ -81,14 +82,15 @@ def terms_of(spec: Mapping[str, Any]) -> list[str]:
 
 
 def _budget(spec: Mapping[str, Any], budget: str) -> int:
-    """A term's own samples; `sppd` that is not set follows `sppi`, as in `Options.budget`."""
-    return spec.get(budget, spec.get("sppi", 1) if budget == "sppd" else 1)
+    """A term's own samples, or those of the budget that it follows, as in `Options.budget`."""
+    return spec.get(budget, spec.get(FOLLOWS.get(budget, budget), 1))
 
 
 def build(spec: Mapping[str, Any]) -> Any:
-    """Instantiate `spec`; an unknown plugin or property becomes an `OptionError`."""
+    """Instantiate `spec`; an unknown plugin or property becomes an `OptionError`. `plan` may be a `Plan`."""
+    given = {key: value.to_json() if isinstance(value, Plan) else value for key, value in spec.items()}
     try:
-        return mi.load_dict(dict(spec))
+        return mi.load_dict(given)
     except RuntimeError as error:
         raise OptionError(f"integrator '{spec.get('type')}' cannot be made: {_last_line(error)}") from error
 

@@ -9,22 +9,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..driver.prepare import prepare
-from ..driver.terms import Term
 from ..edges.table import scene_edges
 from ..errors import OptionError
-from ..plan import plan as plans
 from ..plan.job import Job
-from ..plan.plan import EdgeCount, Plan
+from ..plan.plan import EdgeCount, Plan, with_edges
+from ..plan.term import Term
 from ..scene.io import find_sensor
 from ..scene.params import also_enabled
 from .integrator_specs import build, integrator_spec
-
-#: Why edges are left out of a term's distribution.
-LEFT_OUT = {
-    "primary": "the others rest, are coplanar, turn away or leave the film",
-    "direct": "no light sees the others as an outline, or they are coplanar",
-    "indirect": "the others are coplanar, or lie inside of closed surfaces",
-}
 
 
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
@@ -45,14 +37,14 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
     names = [names] if isinstance(names, str) else list(names)
     with also_enabled(scene, names):
         prepared = prepare(integrator.call(scene, view, 0, spp))
-        counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.weights is not None}
-    return plans.with_edges(prepared.plan, counts)
+        counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.edges is not None}
+    return with_edges(prepared.plan, counts)
 
 
 def _count(term: Term, job: Job) -> EdgeCount:
     table = scene_edges(job)
     total = table.segment_count + table.buried + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
     with dr.suspend_grad():
-        weights = term.weights(job)
+        weights = term.edges.weights(job)
     sampled = 0 if weights is None else int(np.count_nonzero(np.array(weights)))
-    return EdgeCount(sampled, total, LEFT_OUT[term.name], table.buried)
+    return EdgeCount(sampled, total, term.edges.left_out, table.buried)

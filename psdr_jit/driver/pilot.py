@@ -1,4 +1,4 @@
-"""How noisy is each term, in each form? Measured with a few samples of a trial motion, and kept.
+"""How noisy is each term, in each form? Measured with a few samples of a probe's motion, and kept.
 
 What is measured (`plan/probe_motion.py`) is the same for forward and backward mode, and its random numbers are its
 own: weights made from it leave every estimate unbiased. Costs are counted, not timed, so that a seed gives the same
@@ -36,15 +36,10 @@ LEAST, MOST = 1 / 8, 8.0
 #: Between independent samples and stratified ones of a smooth function of one variable.
 SLOWEST, FASTEST = 1.0, 3.0
 
-#: Time of a path relative to one of the interior term (medians over the shipped scenes, two cores).
-RELATIVE_COST = {"interior": 1.0, "primary": 1.1, "direct": 1.1, "indirect": 0.9}
-DIRECT_UNDER_SKY = 2.5  # more lines are drawn than end on anything
-INDIRECT_ON_MATERIAL = 0.6  # one side of an edge is traced
-
 
 @dataclass(frozen=True)
 class TermNoise:
-    """Variance per pixel by paths per pixel: `at_more` · (n / MORE)^−p. `cost`: of a path, see `RELATIVE_COST`."""
+    """Variance per pixel by paths per pixel: `at_more` · (n / MORE)^−p. `cost`: of a path, see `Term.cost`."""
 
     at_more: float
     p: float
@@ -108,7 +103,7 @@ class Measurement:
 def measure(
     job_of: Callable[[str, int, int], Job], forms: Iterable[str], names: Iterable[str], sky: bool
 ) -> Measurement:
-    """Run the pilot for `forms` and the terms called `names`. `job_of(form, seed, spp)`: a job with a trial motion."""
+    """Run the pilot for `forms` and the terms `names`. `job_of(form, seed, spp)`: a job with a probe's motion."""
     found: dict[str, dict[str, TermNoise]] = {}
     for form in forms:
         found[form] = {}
@@ -117,14 +112,8 @@ def measure(
                 _variance([term.forward(job_of(form, FIRST_SEED + k, spp)) for k in range(IMAGES)])
                 for spp in (FEW, MORE)
             )
-            found[form][term.name] = TermNoise.between(few, more, _cost(term.name, form, sky))
+            found[form][term.name] = TermNoise.between(few, more, term.cost(form, sky))
     return Measurement(found)
-
-
-def _cost(name: str, form: str, sky: bool) -> float:
-    if name == "direct" and sky:
-        return DIRECT_UNDER_SKY
-    return INDIRECT_ON_MATERIAL if name == "indirect" and form == "material" else RELATIVE_COST[name]
 
 
 def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.Float:

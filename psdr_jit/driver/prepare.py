@@ -12,39 +12,31 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..core.counters import Rejected
+from ..core.counters import Counters
 from ..core.film import require_film
+from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..errors import OptionError, ZeroDerivativeWarning
-from ..options import Options, require_runtime, samples_per_pixel
-from ..plan import plan as plans
+from ..options import require_runtime, samples_per_pixel
+from ..plan.call import Call
+from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
 from ..plan.job import Job
-from ..plan.plan import Geometry, Plan
-from ..plan.probe_motion import trial_of
-from ..scene.checks import require_supported, warn_about_missing_terms
+from ..plan.motion import SceneMotion
+from ..plan.plan import SWITCHED_OFF, Geometry, Plan
+from ..plan.probe_motion import probe_motion
+from ..plan.term import Term
+from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
 from .noise_log import NoiseLog
 from .pilot import Measurement
-from .terms import TERMS, Term
+from .terms import TERMS
 
-
-@dataclass(frozen=True)
-class Call:
-    """One call of an integrator: who renders what. `cache` outlives it."""
-
-    integrator: mi.CppADIntegrator
-    scene: mi.Scene
-    sensor: mi.Sensor
-    options: Options
-    cache: dict
-    rejected: Rejected
-    grazing: Rejected
-    seed: int | mi.UInt32
-    spp: int  # 0: left to the options and the sampler
-    mode: str = "forward"  # or "backward"
+#: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
+NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)
+PILOTS: Slot[dict[tuple, dict[int, Measurement]]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -61,29 +53,53 @@ class Prepared:
             self.log.observe(self.plan.form, seed, {t.name: t.spp for t in self.plan.terms}, images)
 
 
+@dataclass(frozen=True)
+class _Question:
+    """A call while its plan is being made."""
+
+    call: Call
+    facts: SceneFacts
+    budgets: Mapping[str, int]  # paths per pixel by term, as asked for
+    shared: Memory
+
+    @property
+    def automatic(self) -> bool:
+        """May budgets follow the measured noise?"""
+        return self.call.options.plan == "lean" and not self.call.options.budgets_set
+
+    def job(self, plan: Plan, spp: int) -> Job:
+        """The job of a term that gets `spp` paths per pixel."""
+        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor), self.shared, spp)
+
+
 def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
     film = call.sensor.film()
     require_film(film)
-    budgets = _budgets(call)
+    given = Plan.from_json(call.options.plan) if call.options.plan_is_given else None
+    budgets = _budgets(call) if given is None else {t.name: t.spp for t in given.terms}
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
     require_supported(facts)
-    warn_about_missing_terms(facts, [term.name for term in TERMS], call.options.depth_limit, call.cache)
-    shared: dict = {}
-    plan, log = _plan(call, facts, budgets, shared)
-    switched_off = any(term.reason == plans.SWITCHED_OFF for term in plan.terms)
+    question = _Question(call, facts, budgets, Memory())
+    plan, log = _plan(question) if given is None else (_require_terms(given), None)
+    switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=4)
-    jobs = [
-        (term, Job(
-            call.integrator, call.scene, call.sensor, facts, call.options, plan, call.cache, shared, call.rejected,
-            call.grazing, call.seed, plan.term(term.name).spp,
-        ))
-        for term in TERMS if plan.term(term.name).runs
-    ]  # fmt: skip
-    return Prepared(plan, jobs, log)
+    by_name = {term.name: term for term in TERMS}
+    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
+
+
+def _require_terms(plan: Plan) -> Plan:
+    """A plan that was given must speak of the terms that there are."""
+    known, named = [t.name for t in TERMS], [t.name for t in plan.terms]
+    if sorted(known) != sorted(named):
+        raise OptionError(
+            f"the given plan has the terms {', '.join(named)}, but there are {', '.join(known)}: "
+            "make it anew with psdr_jit.make_plan"
+        )
+    return plan
 
 
 def _facts(call: Call) -> SceneFacts:
@@ -105,25 +121,26 @@ def _budgets(call: Call) -> dict[str, int]:
     return budgets
 
 
-def _plan(call: Call, facts: SceneFacts, budgets: Mapping[str, int], shared: dict) -> tuple[Plan, NoiseLog | None]:
+def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
+    call, budgets = q.call, q.budgets
     geometry = Geometry()
-    if facts.geometry_moves and call.options.plan == "lean":
-        geometry = Geometry(lone_convex(call.scene, call.sensor, facts, call.cache))
-    forms, reason = forms_to_try(call.scene, facts, call.options)
+    if q.facts.geometry_moves and call.options.plan == "lean":
+        geometry = Geometry(lone_convex(call.scene, call.sensor, q.facts, call.memory))
+    forms, reason = forms_to_try(call.scene, q.facts, call.options)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
-        return plans.make(facts, call.options, geometry, spp, form, why)
+        return make_plan_of(decide(TERMS, q.facts, call.options, geometry, spp), call.options, form, why)
 
     plan = made(budgets, (forms[0], reason), "equal")
-    automatic = len(plan.running) > 1 and call.options.plan == "lean" and not call.options.budgets_set
+    automatic = q.automatic and len(plan.running) > 1
     if not plan.running or (len(forms) == 1 and not automatic):
         return plan, None
-    log = call.cache.setdefault(("noise", call.options, *_kind(call, facts, forms), *budgets.values()), NoiseLog())
+    log = call.memory[NOISE].setdefault((call.options, *_kind(q, forms), *budgets.values()), NoiseLog())
     if log.needs_pilot and not dr.flag(dr.JitFlag.FreezingScope):  # which records, but must not read back
         # Terms that are switched off here as well: integrators of one term each must agree on the form.
         names = [term.name for term in made(dict.fromkeys(budgets, 1), (forms[0], ""), "").running]
-        log.pilot(_pilot(call, facts, plan, forms, names, log.epoch, shared))
+        log.pilot(_pilot(q, plan, forms, names, log.epoch))
     if log.current is not None and log.due:
         log.learn()
         form = _best_form(log.measured, max(budgets.values()), (forms[0], reason))
@@ -136,29 +153,25 @@ def _plan(call: Call, facts: SceneFacts, budgets: Mapping[str, int], shared: dic
     return log.plan or plan, log
 
 
-def _kind(call: Call, facts: SceneFacts, forms: tuple[str, ...]) -> tuple:
+def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:
     """What calls of one kind have in common, whatever their budgets."""
-    o = call.options
+    o, sensor = q.call.options, q.call.sensor
     options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction)
-    return (facts.enabled, facts.sensor.name, tuple(call.sensor.film().crop_size()), options, forms)
+    return (q.facts.enabled, q.facts.sensor.name, tuple(sensor.film().crop_size()), options, forms)
 
 
-def _pilot(
-    call: Call, facts: SceneFacts, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int, shared: dict
-) -> Measurement:
-    """The pilot of this epoch; run unless an integrator with the same cache has done so."""
-    found = call.cache.setdefault(("pilot", *_kind(call, facts, forms)), {})
+def _pilot(q: _Question, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int) -> Measurement:
+    """The pilot of this epoch; run unless an integrator with the same memory has done so."""
+    found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
-        trial = trial_of(call.scene, facts)
+        motion = probe_motion(q.call.scene, q.facts)
 
         def job_of(form: str, seed: int, spp: int) -> Job:
-            return Job(
-                call.integrator, call.scene, call.sensor, facts, call.options, replace(plan, form=form), call.cache,
-                shared, Rejected(), Rejected(), seed, spp, trial,
-            )  # fmt: skip
+            call = replace(q.call, seed=seed, counters=Counters())
+            return Job(call, q.facts, replace(plan, form=form), motion, q.shared, spp)
 
         found.clear()
-        found[epoch] = pilot.measure(job_of, forms, names, call.scene.environment() is not None)
+        found[epoch] = pilot.measure(job_of, forms, names, q.call.scene.environment() is not None)
     return found[epoch]
 
 

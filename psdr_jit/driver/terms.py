@@ -1,34 +1,28 @@
-"""The table of derivative terms that an integrator sums, and the job description each of them receives.
+"""The table of derivative terms that an integrator sums.
 
-Adding a term: one module with `forward(job)` and `backward(job, grad_in)`, one row here, one budget in `options.py`.
+Adding a term: one file with its estimator and its `TERM` (`plan.term` says what that is), one entry here, one budget in
+`options.py`. Planning, pilot, command line and tests iterate over this table and know no term by name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
-import mitsuba as mi
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from ..boundary import direct, indirect, primary
 from ..interior import term as interior_term
-from ..plan.job import Job
+from ..plan.term import Term
+
+TERMS: list[Term] = [interior_term.TERM, primary.TERM, direct.TERM, indirect.TERM]
 
 
-@dataclass(frozen=True)
-class Term:
-    """A summand of the derivative image. `budget` names the option that holds its samples per pixel."""
-
-    name: str
-    budget: str
-    forward: Callable[[Job], mi.TensorXf]
-    backward: Callable[[Job, mi.TensorXf], None]
-    weights: Callable[[Job], mi.Float | None] | None = None  # of the edges it samples, by row of the edge table
-
-
-TERMS = (
-    Term("interior", "sppc", interior_term.forward, interior_term.backward),
-    Term("primary", "sppp", primary.forward, primary.backward, primary.edge_weights),
-    Term("direct", "sppd", direct.forward, direct.backward, direct.edge_weights),
-    Term("indirect", "sppi", indirect.forward, indirect.backward, indirect.edge_weights),
-)
+@contextmanager
+def registered(term: Term) -> Iterator[None]:
+    """Integrators sum `term` as well, inside of a `with` block: for terms that live elsewhere, or on trial."""
+    if any(term.name == other.name for other in TERMS):
+        raise ValueError(f"there is a term called '{term.name}' already: give it another name")
+    TERMS.append(term)
+    try:
+        yield
+    finally:
+        TERMS.remove(term)

@@ -42,7 +42,7 @@ def _may_hide(job: Job, body: ShapeFacts, frame: SensorFrame) -> bool:
         return False
     starts = [origin_box(frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
     outside = all(apart(*start, shape.bbox()) for start in starts)
-    return outside and is_convex_body(shape, body, job.cache)
+    return outside and is_convex_body(shape, body, job.call.memory)
 
 
 def _place(job: Job, index: int, facts: EmitterFacts) -> tuple:

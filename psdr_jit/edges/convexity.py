@@ -7,12 +7,16 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box, sensor_frame
 from ..scene.capabilities import SUPPORTED_SENSORS
 from ..scene.facts import SceneFacts, ShapeFacts
 from .overlaps import apart
 from .shells import edge_shells
 from .topology import build_edge_topology
+
+#: By name of a mesh: its faces, and whether they are one closed surface with its normals outward.
+CLOSED: Slot[dict[str, tuple[mi.UInt32, bool]]] = Slot(dict)
 
 #: Pairs of a face and a vertex up to which a mesh is looked at.
 MAX_PAIRS = 2**22
@@ -21,7 +25,7 @@ MAX_PAIRS = 2**22
 FLATNESS = 1e-5
 
 
-def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, cache: dict) -> str:
+def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> str:
     """Name of the scene's only shape if it is convex, opaque, and the sensor outside of its bounding box; else ""."""
     if len(facts.shapes) != 1 or facts.sensor.plugin not in SUPPORTED_SENSORS:
         return ""
@@ -32,28 +36,28 @@ def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, cache: di
     if not apart(lower, upper, box):
         return ""
     flat = only.plugin in ("disk", "rectangle")
-    return only.name if flat or is_convex_body(scene.shapes()[0], only, cache) else ""
+    return only.name if flat or is_convex_body(scene.shapes()[0], only, memory) else ""
 
 
-def is_convex_body(shape: mi.Shape, facts: ShapeFacts, cache: dict) -> bool:
+def is_convex_body(shape: mi.Shape, facts: ShapeFacts, memory: Memory) -> bool:
     """Is it a sphere, or a closed convex mesh with its normals outward? False of meshes too large to look at."""
     if facts.plugin == "sphere":
         return True
     if not facts.is_mesh or facts.faces * shape.vertex_count() > MAX_PAIRS:
         return False
-    return _is_closed(shape, cache) and _is_behind_its_faces(shape)
+    return _is_closed(shape, memory) and _is_behind_its_faces(shape)
 
 
-def _is_closed(mesh: mi.Mesh, cache: dict) -> bool:
+def _is_closed(mesh: mi.Mesh, memory: Memory) -> bool:
     """One closed surface with its normals outward. Remembered while the faces are the same."""
     faces = faces_buffer(mesh)
-    key = ("closed", mesh.id())
-    known = cache.get(key)
+    known = memory[CLOSED].get(mesh.id())
     if known is None or not same_faces(known[0], faces):
         p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
         topology = build_edge_topology(p, f)
-        cache[key] = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
-    return cache[key][1]
+        known = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
+        memory[CLOSED][mesh.id()] = known
+    return known[1]
 
 
 def _is_behind_its_faces(mesh: mi.Mesh) -> bool:

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_faces, mesh_positions, positions_buffer
+from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
 from . import intersections as cut
@@ -27,6 +28,13 @@ from .topology import EdgeTopology
 
 #: Pieces into which the full circle of a ball in a plane is cut.
 ARC_PIECES = 64
+
+
+#: By the names of two shapes: their states, and the junctions found for these.
+PAIRS: Slot[dict[tuple[str, str], tuple]] = Slot(dict)
+
+#: The junctions (by identity) that were uploaded last, and their table.
+UPLOADED: Slot[tuple | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -77,25 +85,25 @@ class JunctionTable:
     rows: JunctionRows
 
 
-def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], cache: dict) -> JunctionTable | None:
-    """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `cache`."""
+def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> JunctionTable | None:
+    """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `memory`."""
     found, changed = [], False
     for a, b in _pairs(solids, balls):
-        key = ("junctions", a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
+        key = (a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
         state = (_state(a), _state(b))
-        known = cache.get(key)
+        known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
             known = (state, _pair(a, b))
-            cache[key] = known
+            memory[PAIRS][key] = known
             changed = True
         if known[1] is not None:
             found.append(known[1])
     if not found:
         return None
-    table = cache.get(("junction table",))
+    table = memory[UPLOADED]
     if changed or table is None or table[0] != [id(f) for f in found]:
         table = ([id(f) for f in found], _upload(found), found)
-        cache[("junction table",)] = table
+        memory[UPLOADED] = table
     return table[1]
 
 

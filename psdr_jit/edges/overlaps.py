@@ -7,8 +7,12 @@ import warnings
 import mitsuba as mi
 import numpy as np
 
+from ..core.memory import Memory, Slot
 from ..errors import UnsupportedWarning
 from .intersections import RESTING
+
+#: Names of the pairs that have been warned about.
+SAID: Slot[set[tuple[str, str]]] = Slot(set)
 
 #: Shapes without triangles.
 ANALYTIC = ("disk", "cylinder", "sphere")
@@ -42,15 +46,16 @@ def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
     return list(zip(i[cuts].tolist(), j[cuts].tolist(), strict=True))
 
 
-def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], said: dict) -> None:
+def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], memory: Memory) -> None:
     """Name those of the crossing `pairs` of `(shape, plugin)` whose curve is not looked for, once each."""
     for i, j in pairs:
         (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
         covered = not curved or curved == ["sphere"]
-        key = ("pair", a.id(), b.id())
-        if not covered and key not in said and not (curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))):
-            said[key] = True
+        covered |= curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))
+        key = (a.id(), b.id())
+        if not covered and key not in memory[SAID]:
+            memory[SAID].add(key)
             warnings.warn(
                 f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) may cut into each other: the curve where they "
                 "meet is found for meshes and for a sphere in a mesh only, its part of the derivative is missing; "

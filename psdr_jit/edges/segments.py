@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
@@ -44,6 +45,10 @@ class _MeshTopology:
     shell: mi.Float  # per edge, see EdgeRows
 
 
+#: By name of a mesh and its numbers of vertices and faces.
+TOPOLOGIES: Slot[dict[tuple[str, int, int], _MeshTopology]] = Slot(dict)
+
+
 @dataclass(frozen=True)
 class EdgeSet:
     """Straight edges of `meshes`, and the curves along which they cut into each other. `rows`: None without any."""
@@ -55,8 +60,8 @@ class EdgeSet:
     normals: mi.Normal3f | None  # by vertex, 0 on flat-shaded meshes; None if all are
 
 
-def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict, balls: tuple[Ball, ...] = ()) -> EdgeSet:
-    """Edges of `meshes` in their present state; topologies are kept in `cache` from call to call.
+def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: tuple[Ball, ...] = ()) -> EdgeSet:
+    """Edges of `meshes` in their present state; topologies are kept in `memory` from call to call.
 
     Intersection curves of meshes with each other and with `balls` are appended as rows of their own. Coinciding edges
     of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
@@ -69,12 +74,12 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], cache: dict, balls: tupl
         positions = dr.detach(mesh_positions(mesh))
         faces = mesh_faces(mesh)
         dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
-        topology = _cached_topology(mesh, positions, faces, cache)
+        topology = _cached_topology(mesh, positions, faces, memory)
         parts.append(_rows(mesh, positions, faces, topology, i, first_vertex, moving[i]))
         solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
         first_vertex += dr.width(positions)
     rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
-    found = find_junctions(solids, balls, cache)
+    found = find_junctions(solids, balls, memory)
     if found is not None:
         rows = concatenate([rows, found.edges])
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
@@ -102,19 +107,20 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
     return mi.Point3f(*(dr.concat([p[axis] for p in positions]) for axis in range(3)))
 
 
-def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, cache: dict) -> _MeshTopology:
+def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> _MeshTopology:
     buffer = faces_buffer(mesh)
-    key = ("edges", mesh.id(), dr.width(positions), dr.width(faces))
-    known = cache.get(key)
+    key = (mesh.id(), dr.width(positions), dr.width(faces))
+    known = memory[TOPOLOGIES].get(key)
     if known is not None and _still_holds(known, buffer, positions, faces):
         return known
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
     warn_about_mesh(mesh.id(), topology)
     shell = uploaded(mi.Float, edge_shells(topology, p, f))
-    cache[key] = _MeshTopology(buffer, topology, upload_topology(topology), shell)
-    _still_holds(cache[key], buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
-    return cache[key]
+    known = _MeshTopology(buffer, topology, upload_topology(topology), shell)
+    memory[TOPOLOGIES][key] = known
+    _still_holds(known, buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
+    return known
 
 
 def warn_about_mesh(name: str, topology: EdgeTopology) -> None:

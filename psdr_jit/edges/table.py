@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import mesh_buffers
+from ..core.memory import Slot
 from ..core.sensor_frame import SensorFrame, origin_box, sensor_frame
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
@@ -16,10 +17,18 @@ from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .curves import CurveSet, curve_set
 from .junctions import Ball
+from .location import EdgeLocation
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .points import EdgePoint, Side, curve_motion, curve_sides, segment_motion, segment_sides
 from .rows import EdgeRows
 from .segments import EdgeSet, edge_set
+
+#: Of one render call: the table, and the geometry of its sensor.
+TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
+FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
+
+#: Of an integrator: the arrays that straight edges were made from while every shape rests, and these edges.
+RESTING: Slot[tuple[list, EdgeSet] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -52,12 +61,34 @@ class EdgeTable:
     def has_curves(self) -> bool:
         return self.curves.rows is not None
 
+    def moves(self, at: EdgeLocation) -> mi.Bool:
+        """Can these edges move?"""
+        straight = at.row < self.segment_count
+        moves = mi.Bool(False)
+        if self.has_segments:
+            moves |= dr.gather(mi.Bool, self.segments.rows.moves, at.row, straight)
+        if self.has_curves:
+            shape = dr.gather(mi.UInt32, self.curves.rows.shape, at.row - self.segment_count, ~straight)
+            moves |= dr.gather(mi.UInt32, self.curve_moves, shape, ~straight) != 0
+        return moves
+
+    def displacement(self, at: EdgeLocation) -> mi.Vector3f:
+        """Vector of value 0 whose derivative is the material velocity of the edge point, attached."""
+        straight = at.row < self.segment_count
+        motion = mi.Vector3f(0)
+        if self.has_segments:
+            motion += dr.select(straight, segment_motion(self.segments, at.row, at.t, straight), 0)
+        if self.has_curves:
+            x = curve_motion(self.curves, at.row - self.segment_count, at.local, ~straight)
+            motion += dr.select(straight, 0, x - dr.detach(x))
+        return motion
+
 
 def scene_edges(job: Job) -> EdgeTable:
-    """Edges of all shapes, built once per render call; mesh topologies live in the job's cache."""
-    if "edges" not in job.shared:
-        job.shared["edges"] = _edge_table(job)
-    return job.shared["edges"]
+    """Edges of all shapes, built once per render call; mesh topologies outlive it."""
+    if job.shared[TABLE] is None:
+        job.shared[TABLE] = _edge_table(job)
+    return job.shared[TABLE]
 
 
 def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
@@ -74,23 +105,23 @@ def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
 
 def shared_frame(job: Job) -> SensorFrame:
     """Geometry of the job's sensor, read once per render call."""
-    if "frame" not in job.shared:
-        job.shared["frame"] = sensor_frame(job.sensor)
-    return job.shared["frame"]
+    if job.shared[FRAME] is None:
+        job.shared[FRAME] = sensor_frame(job.sensor)
+    return job.shared[FRAME]
 
 
 def _segments(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
     """Straight edges of the scene; kept from call to call while every shape rests."""
     shapes = [job.scene.shapes()[s.index] for s in meshes]
     if job.facts.shapes_move or balls or not job.plan.prunes:
-        return edge_set(shapes, [s.moves for s in meshes], job.cache, balls)
+        return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls)
     buffers = [buffer for shape in shapes for buffer in mesh_buffers(shape)]
-    known = job.cache.get("resting edges")
+    known = job.call.memory[RESTING]
     # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
     same = known is not None and [b.index for b in known[0]] == [b.index for b in buffers]
     if not same:
-        known = (buffers, edge_set(shapes, [False] * len(shapes), job.cache))
-        job.cache["resting edges"] = known
+        known = (buffers, edge_set(shapes, [False] * len(shapes), job.call.memory))
+        job.call.memory[RESTING] = known
     rows = known[1].rows
     return known[1] if rows is None else replace(known[1], meshes=tuple(shapes), rows=copy(rows))
 
@@ -101,7 +132,7 @@ def _edge_table(job: Job) -> EdgeTable:
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     pairs = crossing([box_of(shapes[s.index]) for s in chosen])
-    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.cache)
+    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
     overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
     segments, buried_count = _without_buried(job, _segments(job, meshes, balls), overlapping)
     if segments.rows is not None:
@@ -193,30 +224,3 @@ def compact(record, active: mi.Bool):
     """
     dr.eval(record, active)
     return dr.gather(type(record), record, dr.compress(active))
-
-
-def row_moves(table: EdgeTable, row: mi.UInt32) -> mi.Bool:
-    """Can these edges move?"""
-    straight = row < table.segment_count
-    moves = mi.Bool(False)
-    if table.has_segments:
-        moves |= dr.gather(mi.Bool, table.segments.rows.moves, row, straight)
-    if table.has_curves:
-        shape = dr.gather(mi.UInt32, table.curves.rows.shape, row - table.segment_count, ~straight)
-        moves |= dr.gather(mi.UInt32, table.curve_moves, shape, ~straight) != 0
-    return moves
-
-
-def edge_motion(table: EdgeTable, row: mi.UInt32, t: mi.Float, local: mi.Point3f) -> mi.Vector3f:
-    """Vector of value 0 whose derivative is the material velocity of the edge point, attached.
-
-    `local`: material point of a curve (object space), unused on straight edges.
-    """
-    straight = row < table.segment_count
-    motion = mi.Vector3f(0)
-    if table.has_segments:
-        motion += dr.select(straight, segment_motion(table.segments, row, t, straight), 0)
-    if table.has_curves:
-        x = curve_motion(table.curves, row - table.segment_count, local, ~straight)
-        motion += dr.select(straight, 0, x - dr.detach(x))
-    return motion

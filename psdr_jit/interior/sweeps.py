@@ -32,7 +32,7 @@ import mitsuba as mi
 from ..core.ad import tangents
 from ..core.records import Arrival, Hit, Vertex
 from ..paths.recording import GRAZING, PathRecords
-from ..plan.probe_motion import STILL, Shift, Trial
+from ..plan.motion import Displacements, Motion
 
 
 @dataclass
@@ -52,10 +52,9 @@ class SceneTraits:
     delta_lobes: bool  # only together with static geometry, see `scene.checks`
     moves: bool  # geometry, a light's pose or the camera depend on θ; otherwise the paths themselves are constants
     form: str = "spatial"  # what vertices do from the second on: slide along their rays, or stay on their material
-    trial: Trial | None = None  # motion that takes the place of the scene's own
 
 
-def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, shift: Shift, active: mi.Bool):
+def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
     `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
@@ -63,7 +62,7 @@ def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, shift: Shift, active
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
     si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    shift.segment_end(si, hit)
+    moves.follow(si, hit)
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
@@ -77,9 +76,11 @@ def _material_segment(x: mi.Point3f, hit: Hit, wavelengths, shift: Shift, active
     return si, ω, dr.relative_grad(measure)
 
 
-def _emission_towards(x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, shift: Shift, active: mi.Bool):
+def _emission_towards(
+    x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, moves: Displacements, active: mi.Bool
+):
     """Emission of the material point `hit` towards the attached point `x`: `(ω, L_e · measure)`, both attached."""
-    si, ω, measure = _material_segment(x, hit, wavelengths, shift, active)
+    si, ω, measure = _material_segment(x, hit, wavelengths, moves, active)
     return ω, emitter.eval(si, active) * measure
 
 
@@ -97,15 +98,15 @@ def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
     return dr.select(on_mesh, dr.norm(dr.cross(p1 - p0, p2 - p0)), area)
 
 
-def _next_event(si, bsdf, nee, traits: SceneTraits, shift: Shift):
+def _next_event(si, bsdf, nee, traits: SceneTraits, moves: Displacements):
     """Scattered emitter sample, attached: f(ω) · value · weight."""
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
-    ω, value = _emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, shift, active)
+    ω, value = _emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, moves, active)
     if traits.delta_emitters:
         is_delta = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
         seen = mi.SurfaceInteraction3f(si)
-        seen.p = seen.p - shift.of_lights()
+        seen.p = seen.p - moves.of_lights()
         ds, value_delta = emitter.sample_direction(seen, mi.Point2f(0.5), is_delta)
         ω = dr.select(is_delta, ds.d, ω)
         value = dr.select(is_delta, value_delta, value)
@@ -143,7 +144,7 @@ def _terms_of_resting(scene: mi.Scene, vertex: Vertex, following: Arrival, ray: 
 
 
 def _terms_on_material(
-    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, shift: Shift
+    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, moves: Displacements
 ):
     """`vertex_terms` in material form: every vertex but the first stays where it is on its surface.
 
@@ -151,22 +152,19 @@ def _terms_on_material(
     that Mitsuba's own intersection yields the attached frame and texture coordinates of the same material point.
     """
     ctx = mi.BSDFContext()
-    pi = vertex.hit.intersection()
-    resting = mi.Ray3f(vertex.hit.o, vertex.hit.d, 0, ray.wavelengths)
-    material = pi.compute_surface_interaction(resting, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, pi.is_valid()).p
     along = mi.Ray3f(ray)
-    material = material + shift.at(material, vertex.hit.shape)
+    material = moves.material_point(vertex.hit, ray.wavelengths)
     along.o = dr.select(first, ray.o, dr.replace_grad(vertex.hit.o, material))
     along.d = dr.select(first, ray.d, vertex.hit.d)
-    si = shift.surface(vertex.hit, along, mi.RayFlags.All)
+    si = moves.surface(vertex.hit, along, mi.RayFlags.All)
     arrival = dr.replace_grad(vertex.hit.d, dr.normalize(si.p - ray.o))
     si.wi = dr.select(first | ~si.is_valid(), si.wi, si.to_local(-arrival))
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
     bsdf = si.bsdf()
-    L += _next_event(si, bsdf, vertex.nee, traits, shift)
+    L += _next_event(si, bsdf, vertex.nee, traits, moves)
 
     goes_on = vertex.inv_pdf != 0
-    onward, ω, measure = _material_segment(si.p, following.hit, si.wavelengths, shift, goes_on)
+    onward, ω, measure = _material_segment(si.p, following.hit, si.wavelengths, moves, goes_on)
     w = bsdf.eval(ctx, si, si.to_local(ω), goes_on) * measure * dr.abs(vertex.inv_pdf)
     emitter = dr.select(onward.is_valid(), onward.shape.emitter(), scene.environment())
     emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
@@ -180,19 +178,19 @@ def _throughput_ratio(vertex: Vertex, following: Arrival) -> mi.Spectrum:
 
 
 def vertex_terms(
-    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, shift: Shift
+    scene: mi.Scene, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first, traits: SceneTraits, moves: Displacements
 ):
     """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads."""
     if not traits.moves:
         return _terms_of_resting(scene, vertex, following, ray, traits)
     if traits.form == "material":
-        return _terms_on_material(scene, vertex, following, ray, first, traits, shift)
+        return _terms_on_material(scene, vertex, following, ray, first, traits, moves)
     ctx = mi.BSDFContext()
-    si = shift.surface(vertex.hit, ray, mi.RayFlags.All)
+    si = moves.surface(vertex.hit, ray, mi.RayFlags.All)
     L = dr.select(first, vertex.weight_emission * si.emitter(scene).eval(si, first), 0)
 
     bsdf = si.bsdf()
-    L += _next_event(si, bsdf, vertex.nee, traits, shift)
+    L += _next_event(si, bsdf, vertex.nee, traits, moves)
 
     goes_on = vertex.inv_pdf != 0
     inv_pdf = dr.abs(vertex.inv_pdf)
@@ -201,7 +199,7 @@ def vertex_terms(
     found = following.hit.intersection()
     emitter = dr.select(found.is_valid(), found.shape.emitter(), scene.environment())
     emits = goes_on & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
-    ω, value = _emission_towards(si.p, following.hit, si.wavelengths, emitter, shift, emits)
+    ω, value = _emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
     w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
     if traits.delta_lobes:
         is_delta, ratio = vertex.inv_pdf < 0, _throughput_ratio(vertex, following)
@@ -210,13 +208,8 @@ def vertex_terms(
     return VertexTerms(si.p, L, w)
 
 
-def _resumed(trial: Trial | None, *variables):
-    """Gradients of everything, or in a trial of these variables alone."""
-    return dr.resume_grad() if trial is None else dr.resume_grad(*variables)
-
-
 @dr.syntax
-def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, traits: SceneTraits):
+def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, traits: SceneTraits, motion: Motion):
     """Accumulate ⟨δL, dL⟩ into the scene's parameters; returns the adjoints `(λ_o, λ_d)` of the camera rays.
 
     `δL`: adjoint of each path's radiance, detached.
@@ -226,15 +219,13 @@ def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, trai
     λ_o = mi.Vector3f(0)
     λ_d = mi.Vector3f(0)
     active = k > 0
-    while dr.hint(active, label="psdr.interior.backward", exclude=[traits]):
+    while dr.hint(active, label="psdr.interior.backward", exclude=[traits, motion]):
         k -= 1
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & (v.inv_pdf != 0))
-        with dr.resume_grad():
-            o = mi.Point3f(v.hit.o)
-            d = mi.Vector3f(v.hit.d)
-            dr.enable_grad(o, d)
-            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits, STILL)
+        o, d = mi.Point3f(v.hit.o), mi.Vector3f(v.hit.d)
+        with motion.attached(o, d) as moving:
+            t = vertex_terms(scene, v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, traits, moving)
             Lo = t.L + t.w * rest
             dr.backward_from(dr.sum(δL * v.β * Lo) + dr.dot(λ_o, t.x))
             λ_o = mi.Vector3f(dr.grad(o))
@@ -245,7 +236,7 @@ def backward_sweep(scene: mi.Scene, records: PathRecords, δL: mi.Spectrum, trai
 
 
 @dr.syntax
-def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits: SceneTraits) -> mi.Spectrum:
+def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits: SceneTraits, motion: Motion):
     """Derivative of each path's radiance, given the tangents `(ȯ, ḋ)` of its camera ray. Detached result."""
     k = mi.UInt32(0)
     dL = mi.Spectrum(0)
@@ -253,21 +244,15 @@ def forward_sweep(scene: mi.Scene, records: PathRecords, o_grad, d_grad, traits:
     o_grad = mi.Vector3f(o_grad)
     d_grad = mi.Vector3f(d_grad)
     active = k < records.count
-    while dr.hint(active, label="psdr.interior.forward", exclude=[traits]):
+    while dr.hint(active, label="psdr.interior.forward", exclude=[traits, motion]):
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & (v.inv_pdf != 0))
         o, d = mi.Point3f(v.hit.o), mi.Vector3f(v.hit.d)
-        shift, turn = mi.Vector3f(0), mi.Vector3f(0)
-        with dr.resume_grad():
-            dr.enable_grad(o, d, shift, turn)
-        with _resumed(traits.trial, o, d, shift, turn):
+        with motion.attached(o, d) as moving:
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            if dr.hint(traits.trial is not None, mode="scalar"):
-                dr.set_grad(shift, traits.trial.shift)
-                dr.set_grad(turn, traits.trial.turn)
             ray = mi.Ray3f(o, d, 0, records.wavelengths)
-            t = vertex_terms(scene, v, following, ray, k == 0, traits, Shift(traits.trial, shift, turn))
+            t = vertex_terms(scene, v, following, ray, k == 0, traits, moving)
             # x is an input of L: keep the gradients of interior nodes until they have been read
             L_grad, w_grad, x_grad = tangents(t.L, t.w, t.x)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad

@@ -14,21 +14,30 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.ad import accumulate, tangents
+from ..core.ad import accumulate
 from ..core.low_discrepancy import pixel_sampler
+from ..core.memory import Slot
 from ..core.streams import Stream, stream_seed
+from ..options import Options
 from ..paths.dry_walk import count_vertices, touches
 from ..paths.recording import PathRecords
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.walk import PathLimits, first_hit, walk
 from ..plan.job import Job, passes
+from ..plan.plan import Geometry
 from ..plan.probe_motion import registry_table
+from ..plan.reasons import what_changes
+from ..plan.term import Term, Verdict
+from ..scene.facts import SceneFacts
 from .along_walk import MaterialTangents, RadianceTangents
 from .sweeps import SceneTraits, backward_sweep, forward_sweep
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
 
+
+#: Share of the paths that had a derivative when they were looked for last, by an integrator.
+TOUCHED_SHARE: Slot[float] = Slot(float)
 
 #: Share of paths with a derivative from which looking for them costs more than it saves; the others contribute 0.
 MOST_PATHS = 0.6
@@ -67,7 +76,7 @@ def _camera_passes(job: Job) -> Iterator[_Pass]:
     for share, part in passes(job, PathRecords.BYTES_RGB * depth, pixels):
         films.clear(film)
         sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
-        ray, weight, pos = job.integrator.sample_rays(job.scene, job.sensor, sampler)
+        ray, weight, pos = job.call.integrator.sample_rays(job.scene, job.sensor, sampler)
         yield _Pass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
 
 
@@ -107,7 +116,7 @@ def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
     lights = any(e.radiance for e in job.facts.emitters)
     sink = (RadianceTangents if lights else MaterialTangents).zero()
     walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
-    return job.rejected.keep_finite(sink.dL)
+    return job.call.counters.rejected.keep_finite(sink.dL)
 
 
 def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
@@ -119,11 +128,11 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     lane = dr.arange(mi.UInt32, dr.width(p.pos))
     dr.eval(ray, lane)
 
-    if not every_path_differs(job) and job.cache.get("touched share", 0) < MOST_PATHS:
+    if not every_path_differs(job) and job.call.memory[TOUCHED_SHARE] < MOST_PATHS:
         sampler = pixel_sampler(p.seed, lane, p.spp)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
-        job.cache["touched share"] = dr.width(lane) / dr.width(found)
+        job.call.memory[TOUCHED_SHARE] = dr.width(lane) / dr.width(found)
         if dr.width(lane) == 0:
             return PathRecords(0, 0), lane
         ray = dr.gather(mi.Ray3f, ray, lane)
@@ -139,7 +148,7 @@ def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
     )
     records.wavelengths = ray.wavelengths
     if facts.geometry_moves:
-        job.grazing.count(records.cut())
+        job.call.counters.grazing.count(records.cut())
     dr.eval(records.count, records.vertices)
     return records, lane
 
@@ -148,7 +157,7 @@ def _traits(job: Job) -> SceneTraits:
     facts = job.facts
     delta_lobes = any(s.delta_lobes for s in facts.shapes)
     moves = facts.geometry_moves or not job.plan.prunes
-    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form, job.trial)
+    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form)
 
 
 def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
@@ -167,14 +176,11 @@ def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
     dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
     if dr.width(lane) > 0:
         o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-        if job.facts.camera_moves and job.trial is not None:
-            o_grad, d_grad = job.trial.velocity(p.ray.o), dr.cross(job.trial.turn, p.ray.d)
-        elif job.facts.camera_moves:
-            with dr.resume_grad():
-                o_grad, d_grad = tangents(p.ray.o, p.ray.d)
+        if job.facts.camera_moves:
+            o_grad, d_grad = job.motion.camera_tangents(p.ray)
             o_grad = o_grad + _skipped(job, p, records) * d_grad
-        recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job))
-        dr.scatter(dL, job.rejected.keep_finite(recorded), lane)
+        recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job), job.motion)
+        dr.scatter(dL, job.call.counters.rejected.keep_finite(recorded), lane)
         dr.eval(dL)  # the splat reads it inside a recorded loop, where pending writes are not seen
     return dL
 
@@ -198,10 +204,32 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 continue
             δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
             δL = dr.gather(mi.Spectrum, δL, lane)
-            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job))
+            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job), job.motion)
             if job.facts.camera_moves:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():
                     adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
                     accumulate(adjoint)  # other terms need the sensor's edges
             dr.eval()
+
+
+def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
+    """Whatever depends on θ changes paths or what they carry."""
+    if options.depth_limit == 1:
+        radiance = any(e.radiance or e.pose for e in facts.emitters)
+        emitting = any(s.is_emitter and s.shading for s in facts.shapes)
+        slides = facts.geometry_moves and any(e.varies for e in facts.emitters)
+        if not (radiance or emitting or slides):
+            return False, "max_depth = 1: only emission is seen, and it is the same at every point"
+    return True, f"{what_changes(facts)} change along every path"
+
+
+TERM = Term(
+    name="interior",
+    budget="sppc",
+    streams=(Stream.CAMERA, Stream.INTERIOR),
+    needed=needed,
+    cost=lambda form, sky: 1.0,
+    forward=forward,
+    backward=backward,
+)

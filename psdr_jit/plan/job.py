@@ -7,35 +7,45 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from ..core.counters import Rejected
+from ..core.memory import Memory
 from ..options import Options
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
+from .call import Call
+from .motion import Motion
 from .plan import Plan
-from .probe_motion import Trial
 
 
 @dataclass(frozen=True)
 class Job:
     """One term's share of a render call. Host data only; `spp` is the term's own budget."""
 
-    integrator: mi.CppADIntegrator  # provides Mitsuba's `sample_rays`
-    scene: mi.Scene
-    sensor: mi.Sensor
+    call: Call
     facts: SceneFacts
-    options: Options
     plan: Plan
-    cache: dict  # the integrator's: edge sets that outlive a call
-    shared: dict  # of all terms of one render call
-    rejected: Rejected  # the integrator's: counts samples that were not finite ...
-    grazing: Rejected  # ... and paths that end where they meet a surface edge-on
-    seed: int | mi.UInt32
+    motion: Motion  # the scene's own, or a probe in its place (forward mode only)
+    shared: Memory  # of all terms of one render call
     spp: int
-    trial: Trial | None = None  # motion that takes the place of the scene's own (forward mode only)
+
+    @property
+    def scene(self) -> mi.Scene:
+        return self.call.scene
+
+    @property
+    def sensor(self) -> mi.Sensor:
+        return self.call.sensor
 
     @property
     def film(self) -> mi.Film:
-        return self.sensor.film()
+        return self.call.sensor.film()
+
+    @property
+    def options(self) -> Options:
+        return self.call.options
+
+    @property
+    def seed(self) -> int | mi.UInt32:
+        return self.call.seed
 
     @property
     def form(self) -> str:
@@ -62,5 +72,5 @@ def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterat
     while done < job.spp:
         spp = min(per_pass, job.spp - done)
         seed = job.seed if done == 0 else mi.sample_tea_32(mi.UInt32(job.seed), mi.UInt32(done))[0]
-        yield spp / job.spp, replace(job, seed=seed, spp=spp)
+        yield spp / job.spp, replace(job, call=replace(job.call, seed=seed), spp=spp)
         done += spp

@@ -8,17 +8,14 @@ and time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 
-from ..core.streams import Stream
-from ..options import Options
-from ..scene.facts import SceneFacts
+from ..errors import OptionError
+from ..options import FORMS
 
 SWITCHED_OFF = "switched off by its budget"
-
-#: Segments of a path that count when its cost is estimated: deeper ones are rare or dim.
-TYPICAL_DEPTH = 5
 
 
 @dataclass(frozen=True)
@@ -67,6 +64,24 @@ class Plan:
     def running(self) -> tuple[TermPlan, ...]:
         return tuple(t for t in self.terms if t.runs)
 
+    def to_json(self) -> str:
+        """The plan as text, for another process: `plan=` of an integrator takes it."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Plan:
+        """The plan that `to_json` wrote. Raises `OptionError` for any other text."""
+        try:
+            data = json.loads(text)
+            terms = tuple(_term_plan(term) for term in data.pop("terms"))
+            plan = Plan(terms=terms, **data)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            text = _shortened(text)
+            raise OptionError(f"plan = {text}: not a plan ({error}); write one with Plan.to_json") from error
+        if plan.form not in FORMS:
+            raise OptionError(f"a plan has the form {plan.form!r}: use {' or '.join(FORMS)}")
+        return plan
+
     def __str__(self) -> str:
         lines = [f"form     {self.form}: {self.form_reason}", f"budgets  {self.budget_reason}"]
         rows = [("term", "", "spp", "segments/px", "why")]
@@ -80,35 +95,20 @@ class Plan:
         return "\n".join(lines)
 
 
+def _term_plan(data: dict) -> TermPlan:
+    edges = data.pop("edges")
+    return TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=None if edges is None else EdgeCount(**edges))
+
+
+def _shortened(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:40] + "...")
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Facts about shapes that need their vertices."""
 
     lone_convex: str = ""  # name of the only shape, if it is convex, opaque, and seen from outside
-
-
-STREAMS = {
-    "interior": (Stream.CAMERA, Stream.INTERIOR),
-    "primary": (Stream.PRIMARY_EDGE, Stream.PRIMARY_RADIANCE),
-    "direct": (Stream.DIRECT_EDGE, Stream.DIRECT_SUBPATH),
-    "indirect": (Stream.INDIRECT_EDGE, Stream.INDIRECT_SUBPATH, Stream.INDIRECT_RADIANCE),
-}
-
-
-def make(
-    facts: SceneFacts, options: Options, geometry: Geometry, spp: Mapping[str, int], form: tuple[str, str], budgets: str
-) -> Plan:
-    """The plan for `spp` paths per pixel and term (0: switched off). `form`: `(form, reason)`; `budgets`: a reason."""
-    needed = _needed(facts, options, geometry) if options.plan == "lean" else _everything(facts)
-    terms = []
-    for name, (runs, reason) in needed.items():
-        if spp[name] == 0 and runs:
-            runs, reason = False, SWITCHED_OFF
-        depth = min(options.depth_limit, TYPICAL_DEPTH)
-        count = spp[name] if runs else 0
-        streams = tuple(stream.name for stream in STREAMS[name]) if runs else ()
-        terms.append(TermPlan(name, runs, reason, count, streams, count * depth))
-    return Plan(*form, budgets, tuple(terms), options.plan == "lean")
 
 
 def with_edges(plan: Plan, counts: Mapping[str, EdgeCount]) -> Plan:
@@ -121,98 +121,3 @@ def _out_without_edges(term: TermPlan) -> TermPlan:
     if term.edges is None or term.edges.sampled > 0:
         return term
     return replace(term, runs=False, spp=0, segments=0, streams=(), reason="none of its edges can contribute")
-
-
-def _everything(facts: SceneFacts) -> dict[str, tuple[bool, str]]:
-    return {name: (True, "the planner is off") for name in STREAMS}
-
-
-def _needed(facts: SceneFacts, options: Options, geometry: Geometry) -> dict[str, tuple[bool, str]]:
-    """In or out, and why, by term."""
-    nothing = next(_nothing(facts, options), None)
-    if nothing is not None:
-        return {name: (False, nothing) for name in STREAMS}
-    return {
-        "interior": _interior(facts, options),
-        "primary": _primary(facts),
-        "direct": _direct(facts, options, geometry),
-        "indirect": _indirect(facts, options, geometry),
-    }
-
-
-def _nothing(facts: SceneFacts, options: Options) -> Iterator[str]:
-    """Reasons why the whole derivative is 0."""
-    if not facts.anything_enabled:
-        yield facts.still or "no parameter of the scene has gradients enabled"
-    elif options.depth_limit == 0:
-        yield "max_depth = 0: paths without a segment carry no light"
-    elif not facts.emitters:
-        yield "the scene has no light source"
-    elif not _relevant(facts):
-        yield "what has gradients enabled does not enter the image of this sensor"
-
-
-def _relevant(facts: SceneFacts) -> tuple[str, ...]:
-    """The enabled parameters that the image can depend on."""
-    names = tuple(n for s in facts.shapes for n in (*s.geometry, *s.shading, *s.material))
-    return names + tuple(n for e in facts.emitters for n in (*e.pose, *e.radiance)) + facts.sensor.pose
-
-
-def _interior(facts: SceneFacts, options: Options) -> tuple[bool, str]:
-    changes = _changes(facts)
-    if options.depth_limit == 1:
-        radiance = any(e.radiance or e.pose for e in facts.emitters)
-        emitting = any(s.is_emitter and s.shading for s in facts.shapes)
-        slides = facts.geometry_moves and any(e.varies for e in facts.emitters)
-        if not (radiance or emitting or slides):
-            return False, "max_depth = 1: only emission is seen, and it is the same at every point"
-    return True, f"{changes} change along every path"
-
-
-def _changes(facts: SceneFacts) -> str:
-    kinds = [
-        (facts.shapes_move, "shapes"),
-        (any(s.shading for s in facts.shapes), "shading normals or texture coordinates"),
-        (any(s.material for s in facts.shapes), "materials"),
-        (facts.emitters_move, "poses of lights"),
-        (any(e.radiance for e in facts.emitters), "emission"),
-        (facts.camera_moves, "the camera"),
-    ]
-    return ", ".join(text for there, text in kinds if there)
-
-
-def _still(facts: SceneFacts) -> str | None:
-    """Why no discontinuity moves, if none does."""
-    return None if facts.geometry_moves else "no shape, light or camera moves: discontinuities stay where they are"
-
-
-def _primary(facts: SceneFacts) -> tuple[bool, str]:
-    if _still(facts):
-        return False, _still(facts)
-    if not (facts.shapes_move or facts.camera_moves):
-        return False, "only lights without a shape move: every outline stays where it is on the film"
-    return True, "outlines move over the film"
-
-
-def _direct(facts: SceneFacts, options: Options, geometry: Geometry) -> tuple[bool, str]:
-    if _still(facts):
-        return False, _still(facts)
-    if options.depth_limit < 2:
-        return False, "max_depth = 1: nothing is lit, so nothing is in shadow"
-    if geometry.lone_convex:
-        return False, f"'{geometry.lone_convex}' is alone and convex: it casts no shadow on anything"
-    if all(e.delta for e in facts.emitters):
-        return True, "shadows move; every light is a point or a direction, so they are curves: one dimension less"
-    return True, "shadows move"
-
-
-def _indirect(facts: SceneFacts, options: Options, geometry: Geometry) -> tuple[bool, str]:
-    if _still(facts):
-        return False, _still(facts)
-    if options.depth_limit < 3:
-        return False, f"max_depth = {options.depth_limit}: light is scattered once at most"
-    if geometry.lone_convex:
-        return False, f"'{geometry.lone_convex}' is alone and convex: it sees nothing but the sky"
-    if not (facts.shapes_move or facts.camera_moves):
-        return False, "only lights without a shape move: what surfaces see of each other stays the same"
-    return True, "what surfaces see of each other moves"

@@ -8,7 +8,7 @@ radiance gradients of the same scene go through.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
@@ -18,12 +18,6 @@ from .facts import SceneFacts, ShapeFacts
 
 SMALL_SCENE = 0.1
 """Diagonal [scene units] below which the primary term loses more than 0.2 % (measured on a lit box)."""
-
-BOUNDARY_TERMS = {
-    "direct": (2, "moving shadows of the light sources"),
-    "indirect": (3, "moving occlusion of reflected light"),
-}
-"""Terms that the theory has besides interior and primary: from which max_depth on, and what they stand for."""
 
 
 @dataclass(frozen=True)
@@ -255,27 +249,3 @@ CHECKS = (
     check_surface_steps,
     check_emitter_steps,
 )
-
-
-def warn_about_missing_terms(facts: SceneFacts, terms: Iterable[str], depth_limit: int, said: dict) -> None:
-    """Warn once if shadows or indirect visibility move and no term is there for them.
-
-    `terms` are the names in `terms.TERMS`; `said` remembers what has been warned about, per caller.
-    """
-    if not (facts.geometry_moves and facts.emitters):
-        return
-    missing = [f"'{name}' ({what})" for name, (depth, what) in BOUNDARY_TERMS.items()
-               if name not in terms and depth_limit >= depth]  # fmt: skip
-    if not missing:
-        return
-    moving = [f"shape '{s.name}'" for s in facts.shapes if s.moves]
-    moving += [f"emitter '{e.name}'" for e in facts.emitters if e.pose]
-    moving += [f"sensor '{facts.sensor.name}'"] if facts.camera_moves else []
-    message = (
-        f"{' and '.join(missing)} not in the derivative with respect to the motion of {', '.join(moving)}: these "
-        "boundary terms do not exist yet. psdr_jit.check_gradient (psdr gradient --check) tells how much that is; "
-        "with max_depth=1 it is nothing"
-    )
-    if message not in said.setdefault("missing terms", set()):
-        said["missing terms"].add(message)
-        warnings.warn(message, UnsupportedWarning, stacklevel=2)

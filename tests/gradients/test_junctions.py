@@ -57,22 +57,23 @@ def test_against_finite_differences(llvm, monkeypatch, case):
     reference = fd(motion, spec, EPS, 2 * SEEDS, REFERENCE_SPP)
     assert_grad_close(estimate, reference, 0.02)
 
-    monkeypatch.setattr(segments, "find_junctions", lambda solids, balls, cache: None)
+    monkeypatch.setattr(segments, "find_junctions", lambda solids, balls, memory: None)
     with pytest.raises(AssertionError):  # without the curves the comparison fails
         assert_grad_close(forward(motion, spec, SEEDS, SPP), reference, 0.02)
 
 
 def test_they_are_updated_with_the_shapes(llvm):
     """A box that is lifted out of the floor and put back: the curve goes and comes, and rests are remembered."""
+    from psdr_jit.core.memory import Memory
     from psdr_jit.edges.segments import edge_set
 
     scene = sunk("cube", 0.6, 0.0)
     params = mi.traverse(scene)
     original = mi.Float(params["thing.vertex_positions"])
-    meshes, cache = list(scene.shapes()), {}
+    meshes, memory = list(scene.shapes()), Memory()
 
     def count() -> int:
-        rows = edge_set(meshes, [s.id() == "thing" for s in meshes], cache).rows
+        rows = edge_set(meshes, [s.id() == "thing" for s in meshes], memory).rows
         assert np.array(rows.moves)[np.array(rows.junction) > 0].all()
         return int((np.array(rows.junction) > 0).sum())
 

@@ -12,7 +12,6 @@ import pytest
 
 import psdr_jit
 from psdr_jit.cli.main import main
-from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import (
     OptionError,
     ParameterError,
@@ -334,41 +333,6 @@ def test_normals_of_a_mirror_steer_its_reflection():
 
 
 # Warnings
-
-
-def missing_terms(facts, terms, depth):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        said = {}
-        for _ in range(2):
-            checks.warn_about_missing_terms(facts, terms, depth, said)
-    return [str(w.message) for w in caught]
-
-
-def test_missing_boundary_terms_are_said_once():
-    scene = load()
-    enabled(scene, BOX)
-    facts, here = analyse(scene), ["interior", "primary"]
-    assert missing_terms(facts, here, 1) == []
-    (message,) = missing_terms(facts, here, 2)
-    assert "'direct'" in message and "'indirect'" not in message and "shape 'box'" in message
-    (message,) = missing_terms(facts, here, 3)
-    assert "'direct'" in message and "'indirect'" in message
-    (message,) = missing_terms(facts, [*here, "direct"], 3)
-    assert "'direct'" not in message and "'indirect'" in message
-    assert missing_terms(facts, [*here, "direct", "indirect"], 3) == []
-    material = load()
-    enabled(material, FLOOR)
-    assert missing_terms(analyse(material), here, 8) == []
-
-
-def test_the_integrator_warns_by_its_table_of_terms():
-    missing = [name for name in checks.BOUNDARY_TERMS if name not in [t.name for t in TERMS]]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        forward(load(), options={"max_depth": 4})
-    messages = [str(w.message) for w in caught if w.category is UnsupportedWarning]
-    assert len(messages) == bool(missing) and all(f"'{name}'" in messages[0] for name in missing)
 
 
 def test_tiny_scenes_lose_a_part_of_the_derivative():

@@ -1,4 +1,4 @@
-"""Budgets and forms that follow from measured noise: the optimisation, the trial motion, what is learned from calls."""
+"""Budgets and forms that follow from measured noise: the optimisation, the probe, what is learned from calls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from psdr_jit.driver.pilot import Measurement, TermNoise
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.options import Options
 from psdr_jit.plan.form_choice import forms_to_try
-from psdr_jit.plan.probe_motion import trial_of
+from psdr_jit.plan.probe_motion import probe_motion
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.facts import analyse
 from psdr_jit.scene.params import also_enabled
@@ -83,7 +83,7 @@ def test_the_exponent_is_that_of_two_sample_counts():
     assert TermNoise.between(1.0, 1e-9, 1.0).p == pilot.FASTEST
 
 
-# ------------------------------------------------------------------------------------------ the trial motion
+# ------------------------------------------------------------------------------------------ the probe's motion
 
 
 @pytest.mark.parametrize("form", ["spatial", "material"])
@@ -91,18 +91,18 @@ def test_the_exponent_is_that_of_two_sample_counts():
     ("cbox", BOX), ("baffled_light", "blocker.vertex_positions"), ("area_shadow", "light.to_world"),
     ("ball_shadow", "blocker.to_world"), ("area_shadow", "camera.to_world"), ("point_shadow", "lamp.position"),
 ])  # fmt: skip
-def test_the_trial_is_the_derivative_along_its_motion(llvm, form, scene_name, param):
-    """Each term's trial image is the one that the same shift and turn, set on the parameter itself, give."""
+def test_the_probe_is_the_derivative_along_its_motion(llvm, form, scene_name, param):
+    """Each term's image along the probe is the one that the same shift and turn, set on the parameter itself, give."""
     scene = scene_of(scene_name)
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, "form": form, "sppc": 4})
     with also_enabled(scene, [param]):
         prepared = prepare(integrator.call(scene, scene.sensors()[0], 1, 4))
-        trial = trial_of(scene, prepared.jobs[0][1].facts)
-        found = {t.name: np.array(t.forward(replace(job, trial=trial))) for t, job in prepared.jobs}
+        probe = probe_motion(scene, prepared.jobs[0][1].facts)
+        found = {t.name: np.array(t.forward(replace(job, motion=probe))) for t, job in prepared.jobs}
     motion, θ = mi.traverse(scene), mi.Float(0)
     dr.enable_grad(θ)
     value = motion[param]
-    centre, shift, turn = ([float(x) for x in np.array(v).ravel()] for v in (trial.centre, trial.shift, trial.turn))
+    centre, shift, turn = ([float(x) for x in np.array(v).ravel()] for v in (probe.centre, probe.shift, probe.turn))
     angle = float(np.linalg.norm(turn))
 
     def moved(x):
@@ -186,7 +186,7 @@ def test_single_terms_agree_on_the_form(llvm):
 
 
 def test_budgets_learn_from_images(llvm):
-    """Along x nothing inside of the blocker's faces changes: the trial motion did not know."""
+    """Along x nothing inside of the blocker's faces changes: the probe's motion did not know."""
     scene = scene_of("point_shadow")
     motion = perturb(scene, "blocker.vertex_positions", (1, 0, 0))
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2})

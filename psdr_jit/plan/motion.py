@@ -1,0 +1,136 @@
+"""How fast is this point? One question to the scene's own motion and to a probe's alike.
+
+Estimators ask for *displacements*: attached vectors of value 0 whose derivative is the velocity per unit of θ. Forward
+mode reads their tangents, backward mode sends adjoints into them. Who answers is the job's `Motion`: the scene, whose
+enabled parameters move vertices, poses, lights and the camera; or a probe (`probe_motion.py`), which moves everything
+that can move as one body, whatever the parameters do.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.ad import tangents
+from ..core.records import Hit
+
+
+class Displacements(ABC):
+    """What moves, inside of the scope in which it is attached. Vectors of value 0 in world space [m]."""
+
+    @abstractmethod
+    def of_surface(self, hit: Hit) -> mi.Vector3f:
+        """Of the material point at the end of `hit`; 0 where there is no surface."""
+
+    @abstractmethod
+    def of_edge(self, table, location) -> mi.Vector3f:
+        """Of a point of the edge table."""
+
+    @abstractmethod
+    def of_camera(self, film: mi.Point2f, aperture: mi.Point2f, x: mi.Point3f) -> mi.Vector3f:
+        """Of the point at the depth of x on the camera ray through a fixed film position ([0, 1]², crop window)."""
+
+    @abstractmethod
+    def of_light(
+        self, emitter: mi.EmitterPtr, it: mi.Interaction3f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """Of a delta light as seen from `it`: `(of its position, of the direction towards it)`."""
+
+    @abstractmethod
+    def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:
+        """The material point at the end of `hit`, attached to its motion."""
+
+    @abstractmethod
+    def surface(self, hit: Hit, ray: mi.Ray3f, flags) -> mi.SurfaceInteraction3f:
+        """The surface met by the attached `ray`, whose intersection is `hit`: `compute_surface_interaction`."""
+
+    @abstractmethod
+    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
+        """Let a material point `si` (from `RayFlags.FollowShape`) move, in place."""
+
+    @abstractmethod
+    def of_lights(self) -> mi.Vector3f:
+        """Of the lights without a shape, on top of what their own parameters do."""
+
+
+class Motion(ABC):
+    """Host object of a job: opens the scope in which displacements are attached."""
+
+    @abstractmethod
+    def attached(self, *variables):
+        """Context manager that yields `Displacements`. `variables` are attached as well, their gradients enabled."""
+
+    @abstractmethod
+    def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """`(ȯ, ḋ)` of attached camera rays, detached."""
+
+
+@dataclass(frozen=True)
+class SceneMotion(Motion):
+    """The motion that the enabled parameters of the scene stand for."""
+
+    sensor: mi.Sensor
+
+    @contextmanager
+    def attached(self, *variables) -> Iterator[Displacements]:
+        with dr.resume_grad():
+            dr.enable_grad(*variables)
+            yield SceneDisplacements(self.sensor)
+
+    def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        with dr.resume_grad():
+            return tangents(ray.o, ray.d)
+
+
+def moved(x: mi.Vector3f) -> mi.Vector3f:
+    """The derivative of `x` on a value of 0."""
+    return mi.Vector3f(x - dr.detach(x))
+
+
+@dataclass(frozen=True)
+class SceneDisplacements(Displacements):
+    """Read off Mitsuba's own attached geometry."""
+
+    sensor: mi.Sensor
+
+    def of_surface(self, hit: Hit) -> mi.Vector3f:
+        there = hit.shape != 0
+        x = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), _follow(), there).p
+        return dr.select(there, moved(x), 0)
+
+    def of_edge(self, table, location) -> mi.Vector3f:
+        return table.displacement(location)
+
+    def of_camera(self, film: mi.Point2f, aperture: mi.Point2f, x: mi.Point3f) -> mi.Vector3f:
+        ray, _ = self.sensor.sample_ray(0, 0.5, film, aperture)
+        return moved(ray.o + ray.d * dr.detach(dr.dot(x - ray.o, ray.d)))
+
+    def of_light(
+        self, emitter: mi.EmitterPtr, it: mi.Interaction3f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Vector3f]:
+        ds, _ = emitter.sample_direction(it, mi.Point2f(0.5), active)
+        return moved(ds.p), moved(ds.d)
+
+    def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:
+        pi = hit.intersection()
+        ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
+        return pi.compute_surface_interaction(ray, _follow(), pi.is_valid()).p
+
+    def surface(self, hit: Hit, ray: mi.Ray3f, flags) -> mi.SurfaceInteraction3f:
+        return hit.intersection().compute_surface_interaction(ray, flags)
+
+    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
+        """Nothing to do: `RayFlags.FollowShape` has attached it."""
+
+    def of_lights(self) -> mi.Vector3f:
+        return mi.Vector3f(0)
+
+
+def _follow():
+    """The surface point stays on its material while the shape moves; nothing else of the interaction is asked for."""
+    return mi.RayFlags.Minimal | mi.RayFlags.FollowShape

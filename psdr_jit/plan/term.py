@@ -1,0 +1,47 @@
+"""What a term of the derivative is: one record, over which everything that concerns terms iterates.
+
+Adding a term: a file with its estimator and its `TERM`, an entry in `driver.terms`, a budget in `options`, a scene and
+a test. Nothing else knows terms by their names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from ..core.streams import Stream
+from ..options import Options
+from ..scene.facts import SceneFacts
+from .job import Job
+from .plan import Geometry
+
+#: Does a term run, and why (not)?
+Verdict = tuple[bool, str]
+
+
+@dataclass(frozen=True)
+class EdgeSampling:
+    """Of a boundary term: which edges it samples."""
+
+    weights: Callable[[Job], mi.Float | None]  # by row of the edge table, not normalised; None: there are none
+    left_out: str  # why the others are not sampled
+
+
+@dataclass(frozen=True)
+class Term:
+    """A summand of the derivative image.
+
+    `forward(job)` returns its derivative image along the tangents that are set on the scene's parameters (or along
+    `job.motion`), `backward(job, grad_in)` accumulates ⟨grad_in, dI⟩ into them. Both draw the same samples.
+    """
+
+    name: str
+    budget: str  # the option that holds its samples per pixel
+    streams: tuple[Stream, ...]  # of random numbers
+    needed: Callable[[SceneFacts, Options, Geometry], Verdict]  # asked only where something can have a derivative
+    cost: Callable[[str, bool], float]  # time of a path by (form, sky) relative to one of the interior term
+    forward: Callable[[Job], mi.TensorXf]
+    backward: Callable[[Job, mi.TensorXf], None]
+    edges: EdgeSampling | None = None
