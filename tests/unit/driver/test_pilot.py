@@ -16,6 +16,7 @@ from psdr_jit.driver import pilot
 from psdr_jit.driver.noise_log import NoiseLog
 from psdr_jit.driver.pilot import Measurement, TermNoise
 from psdr_jit.driver.prepare import prepare
+from psdr_jit.driver.terms import TERMS
 from psdr_jit.options import Options
 from psdr_jit.plan.form_choice import forms_to_try
 from psdr_jit.plan.probe_motion import probe_motion
@@ -158,8 +159,8 @@ def test_automatic_budgets_cost_as_much_as_equal_ones(llvm):
         integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4})
         plan = prepare(integrator.call(scene, scene.sensors()[0], 0, 32)).plan
         assert len({t.spp for t in plan.running}) > 1
-        cost = sum(pilot.RELATIVE_COST[t.name] * t.spp for t in plan.running)
-        assert cost == pytest.approx(32 * sum(pilot.RELATIVE_COST.values()), rel=0.05)
+        cost = {t.name: t.cost(plan.form, False) for t in TERMS}
+        assert sum(cost[t.name] * t.spp for t in plan.running) == pytest.approx(32 * sum(cost.values()), rel=0.05)
         for explicit in ({"sppc": 7}, {"plan": "full", "form": "spatial"}):
             integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, **explicit})
             plan = prepare(integrator.call(scene, scene.sensors()[0], 0, 32)).plan
