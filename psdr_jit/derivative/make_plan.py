@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..driver.prepare import prepare
-from ..edges.table import scene_edges
+from ..edges.scene_table import scene_edges
 from ..errors import OptionError
 from ..plan.job import Job
 from ..plan.plan import EdgeCount, Plan, with_edges
@@ -43,8 +43,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
 
 def _count(term: Term, job: Job) -> EdgeCount:
     table = scene_edges(job)
-    total = table.segment_count + table.buried + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
     with dr.suspend_grad():
         weights = term.edges.weights(job)
-    sampled = 0 if weights is None else int(np.count_nonzero(np.array(weights)))
-    return EdgeCount(sampled, total, term.edges.left_out, table.buried)
+    sampled = sum(int(np.count_nonzero(np.array(w) > 0)) for w in weights)
+    return EdgeCount(sampled, table.count + table.buried, term.edges.left_out, table.buried)

@@ -31,14 +31,6 @@ def edge_distribution(weight: mi.Float) -> EdgeDistribution:
     return EdgeDistribution(cdf, weight, total)
 
 
-def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
-    """Distribution over the concatenated weights of straight rows and curve rows; None if all vanish."""
-    if not weights:
-        return None
-    distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
-    return distribution if float(distribution.total[0]) > 0 else None
-
-
 def stratified(count: int, jitter: mi.Float) -> mi.Float64:
     """`count` numbers in [0, 1), one in each stratum: (i + jitter_i) / count."""
     # a literal would compile new kernels for every count
