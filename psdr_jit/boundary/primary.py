@@ -118,9 +118,7 @@ def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample:
     view, p = seen.view, seen.view.p
     inside = (p.x >= lower[0]) & (p.x < upper[0]) & (p.y >= lower[1]) & (p.y < upper[1])
     active = seen.valid & inside
-    # A ray aimed at a tangent point meets the shape itself: aim beside it. Fixed edges have scale 0.
-    aim = seen.sight.at.x + VISIBILITY_EPSILON * seen.sight.at.scale * seen.sight.n_perp
-    direction = aim - view.o
+    direction = edges.table.aim(seen.sight) - view.o
     distance = dr.norm(direction)
     ray = mi.Ray3f(view.o, direction / distance)
     ray.maxt = distance * (1 - VISIBILITY_EPSILON)

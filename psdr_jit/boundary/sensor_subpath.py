@@ -28,6 +28,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.sensor_frame import SensorFrame, look_at
 from ..core.streams import Stream, stream_seed
+from ..edges.points import facing
 from ..paths.scattering import UNIFORM_SHARE, sample_scattering
 from ..paths.walk import PathLimits, continue_path
 from ..plan.job import Job
@@ -228,7 +229,7 @@ def walk_to_sensor(
         to_sensor = -view.ω
         wo = si.to_local(to_sensor)
         lower, upper = frame.window
-        seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
         seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
         f = bsdf.eval(ctx, si, wo, seen) * _adjoint_correction(si, to_sensor)
         W = value * throughput * f / view.J_px

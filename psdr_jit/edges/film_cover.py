@@ -55,7 +55,7 @@ class EdgeOnFilm:
         s0, s1 = facing(rows.n0, view), facing(rows.n1, view)
         slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
         outline = (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
-        hidden = ((shell != 0) & (s * shell < -slack) for s, shell in ((s0, rows.shell0), (s1, rows.shell1)))
+        hidden = ((shell != 0) & (s * shell <= -slack) for s, shell in ((s0, rows.shell0), (s1, rows.shell1)))
         return EdgeOnFilm(outline, *hidden)
 
 

@@ -136,6 +136,10 @@ class EdgeKind(ABC):
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """What lies on side `which` of the edge: 0 towards −n_perp, 1 towards +n_perp."""
 
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """Where a ray is aimed that asks whether the viewer sees the edge: the point, or a little off it."""
+        return sight.at.x
+
     @abstractmethod
     def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
         """Vector of value 0 whose derivative is the velocity of the edge there, attached. Its part along the edge is

@@ -25,7 +25,7 @@ from .film_cover import LEAST_LENGTH, LENS_CENTRE, lens_reach, overlaps_film
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import CURVE_LEAD, clearance
+from .points import CURVE_LEAD, VISIBILITY_EPSILON, clearance
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,10 @@ class AnalyticCurves(ContourKind):
             aside=offset,
             valid=active & point.valid,
         )
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """A ray aimed at a tangent point meets the shape itself: beside it."""
+        return sight.at.x + VISIBILITY_EPSILON * sight.at.scale * sight.n_perp
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         return Side.found_by(sight.beside(which), own=which == 0)

@@ -12,7 +12,7 @@ from .film_cover import EdgeOnFilm, straight_cover
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import INSET, clearance
+from .points import INSET, clearance, face_sides
 from .rows import EdgeRows, apex_uv, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
@@ -78,20 +78,24 @@ class MeshEdges(FixedKind):
         side = dr.cross(dx, ω)
         across = dr.norm(side)
         side = dr.select(across > 0, side / across, 0)
-        a0, a1 = dr.dot(dr.cross(n0, dx), side), dr.dot(dr.cross(dx, n1), side)
-        silhouette = (across > 0) & (a0 != 0) & (border | (a0 * a1 > 0))
-        return side * dr.select(a0 > 0, -1.0, 1.0), across, silhouette
+        # Two edges of a face in line with the light cast one shadow: the one whose other face is lit counts.
+        a0, a1 = face_sides(n0, n1, ω)
+        silhouette = (across > 0) & dr.select(border, a0 != 0, (a0 < 0) != (a1 > 0))
+        where_faces_are = a0 + dr.select(border, 0, a1)
+        return side * dr.select(where_faces_are > 0, -1.0, 1.0), across, silhouette
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than
-        any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp); two faces on the same
-        side are a silhouette, of which the one nearer to the viewer is seen.
+        any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp) (`face_sides`); two faces
+        on the same side are a silhouette, of which the one nearer to the viewer is seen. A face seen edge-on is on
+        neither side: the other face, if there is one, then ends at a silhouette.
         """
         rows = dr.gather(EdgeRows, self.rows, row, active)
         τ = dr.normalize(rows.p1 - rows.p0)
         into0, into1 = dr.cross(rows.n0, τ), dr.cross(τ, rows.n1)
-        a0, a1 = dr.dot(into0, sight.n_perp), dr.dot(into1, sight.n_perp)
-        silhouette = ~rows.border & (a0 * a1 > 0)
+        a0, a1 = face_sides(rows.n0, rows.n1, sight.ω)
+        in_view = (a0 != 0) | (a1 != 0)
+        silhouette = ~rows.border & (a0 * a1 >= 0)
         nearer1 = silhouette & (dr.dot(into1, sight.ω) * dr.abs(a0) < dr.dot(into0, sight.ω) * dr.abs(a1))
 
         towards = dr.select(which == 0, -1.0, 1.0)
@@ -103,7 +107,18 @@ class MeshEdges(FixedKind):
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
-        return Side(ray, pi, ~face, own, rows.border | silhouette | rows.seam | rows.traced)
+        return Side(ray, pi, ~face, own, in_view & (rows.border | silhouette | rows.seam) | rows.traced)
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """Onto the other face where one of two is seen edge-on; the point itself at all other edges.
+
+        A line of sight to such an edge runs along the face, and whether it meets what ends with it is rounding.
+        """
+        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        border = dr.gather(mi.Bool, self.rows.border, row, active)
+        a0, a1 = face_sides(n0, n1, sight.ω)
+        one = ~border & ((a0 == 0) ^ (a1 == 0))
+        return sight.at.x + dr.select(one, dr.sign(a0 + a1) * sight.offset, 0) * sight.n_perp
 
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """A point of face 0 or 1 next to the edge, as if the viewer had looked at it."""

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.varying import varying
+from .points import facing
 from .rows import EdgeRows
 
 #: Relative distance from a plane within which a point counts as on it.
@@ -43,7 +44,7 @@ def _may_be_silhouette(rows: EdgeRows, corners: list[mi.Vector4f]) -> mi.Bool:
     both, neither = mi.Bool(True), mi.Bool(True)
     for c in corners:
         towards = mi.Vector3f(c.x, c.y, c.z) - c.w * mi.Vector3f(rows.p0)
-        front0, front1 = dr.dot(rows.n0, towards) > 0, dr.dot(rows.n1, towards) > 0
+        front0, front1 = facing(rows.n0, towards) > 0, facing(rows.n1, towards) > 0
         both &= front0 & front1
         neither &= ~front0 & ~front1
     return ~(both | neither)

@@ -28,6 +28,9 @@ CURVE_LEAD = 0.02
 #: everything it sees would be occluded.
 INSET = 3e-4
 
+#: Sine of the angle to its plane below which a face is seen edge-on: sixteen units in the last place of a direction.
+EDGE_ON = 1e-6
+
 #: Share of the distance to the edge that a visibility ray leaves out.
 VISIBILITY_EPSILON = 1e-4
 
@@ -43,6 +46,20 @@ def clearance(x: mi.Point3f, size: mi.Float, centre: mi.Point3f, blur: mi.Float 
     return visible + rounding, LEAD * visible + ROUNDING_LEAD * rounding
 
 
-def facing(n: mi.Normal3f, towards_viewer: mi.Vector3f) -> mi.Float:
-    """> 0 where a face with normal `n` turns to the viewer, who is in this direction (not normalised)."""
-    return dr.dot(n, towards_viewer)
+def facing(n: mi.Normal3f, towards: mi.Vector3f) -> mi.Float:
+    """n·towards: > 0 where a face with unit normal `n` turns to a viewer in that direction (of any length), < 0 where
+    its back does, and 0 where it is seen edge-on.
+
+    The one rule for faces in line with the viewer, whose sign is a matter of rounding and may differ from one edge of
+    a face to the next: such a face is not seen, and turns away.
+    """
+    cos = dr.dot(n, towards)
+    return dr.select(dr.abs(cos) > EDGE_ON * dr.norm(towards), cos, 0)
+
+
+def face_sides(n0: mi.Normal3f, n1: mi.Normal3f, ω: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """On which side of an edge seen along ω its faces lie: the signs of b_i·(τ×ω), b_i the direction into face i.
+
+    As b_0 = n_0 × τ and b_1 = τ × n_1, a face lies to the one side or to the other as its front or back is seen.
+    """
+    return facing(n0, -ω), -facing(n1, -ω)

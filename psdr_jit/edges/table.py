@@ -54,6 +54,10 @@ class EdgeTable:
         """The point at t of `row` for a viewpoint (homogeneous)."""
         return self.ask(row, lambda kind, own_row, own: kind.on(own_row, t, view, own))
 
+    def aim(self, sight: Sight) -> mi.Point3f:
+        """Where rays are aimed that ask whether the viewer sees the edges."""
+        return self.ask(sight.at.row, lambda kind, row, own: kind.aim(row, sight, own))
+
     def displacement(self, at: EdgeLocation) -> mi.Vector3f:
         """Vector of value 0 whose derivative is the velocity of the edge there, attached."""
         return self.ask(at.row, lambda kind, row, own: kind.displacement(row, at, own))
