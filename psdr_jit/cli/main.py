@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psdr_jit
-from psdr_jit.errors import PsdrError, SetupError
+from psdr_jit.errors import PsdrError, SetupError, StorageError
 
 OK, USAGE, SETUP_MISSING, INTERRUPTED = 0, 2, 3, 130
 TRACEBACK_VARIABLE = "PSDR_TRACEBACK"
@@ -131,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
         if os.environ.get(TRACEBACK_VARIABLE) == "1":
             traceback.print_exc()
         print(f"psdr: error: {error}", file=sys.stderr)
-        return SETUP_MISSING if isinstance(error, SetupError) else USAGE
+        return SETUP_MISSING if isinstance(error, (SetupError, StorageError)) else USAGE
     except ModuleNotFoundError as error:
         if (error.name or "psdr_jit").split(".")[0] == "psdr_jit":
             raise  # a defect of ours, not of the set-up

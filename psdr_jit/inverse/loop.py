@@ -42,7 +42,8 @@ class Result:
     latents: Latents  # detached
     offsets: dict[str, dict[str, float]]  # from the scene's own values, now ...
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
-    not_written: list[str] = field(default_factory=list)  # what the disk did not take
+    not_written: list[str] = field(default_factory=list)  # what the disk did not take ...
+    lost: dict[str, str] = field(default_factory=dict)  # ... and of that the final values, with the reason
 
 
 @dataclass
@@ -83,7 +84,7 @@ def run(
             warnings.simplefilter("ignore", ZeroDerivativeWarning)
             status = _loop(problem, state, journal, losses, progress)
         if status != DIVERGED:
-            journal.keep(_checkpoint(problem, state))
+            journal.keep(_checkpoint(problem, state), last=status == INTERRUPTED)
         found = copied(state.history.best if status == DIVERGED else state.latents)
         problem.apply(found)
         start = problem.offsets(problem.start())
@@ -92,9 +93,9 @@ def run(
         )
         if status != INTERRUPTED:
             journal.finish(problem, result)
-        result.not_written = journal.not_written
     finally:
         journal.close()
+    result.not_written, result.lost = journal.not_written, journal.lost
     return result
 
 
