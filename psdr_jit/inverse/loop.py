@@ -19,6 +19,7 @@ import numpy as np
 from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse.checkpoint import Checkpoint
+from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
 from psdr_jit.inverse.journal import Journal
 from psdr_jit.inverse.problem import Latents, Problem, copied
@@ -116,6 +117,7 @@ class Stepper:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._state = _begin(problem)
+        problem.apply(self._state.latents)
         self._journal = Journal(None, problem, keep=0)
 
     def step(self) -> float:
@@ -136,7 +138,9 @@ class Stepper:
 
 def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float], progress: Any) -> str:
     """Iterate until there is a reason to stop, and return it."""
-    settings, history = problem.settings, state.history
+    settings = problem.settings
+    problem.apply(state.latents)
+    watch = Watch(problem)
     with _interruptible() as interrupted:
         while state.iteration < settings.iterations:
             if interrupted:
@@ -144,13 +148,9 @@ def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float]
             if settings.max_seconds is not None and state.clock() > settings.max_seconds:
                 return OUT_OF_TIME
             losses.append(_iterate(problem, state, journal))
-            if history.diverges(settings.diverged_factor):
-                _say_diverged(state, f"the loss diverged (now {losses[-1]:.3e}, at first {history.scale:.3e})")
-                return DIVERGED
-            broken = [name for name, norm in state.norms.items() if not math.isfinite(norm)]
-            if any(state.lost[name] >= settings.stalled_after for name in broken):
-                _say_diverged(state, f"the gradient of {', '.join(broken)} has not been finite for "
-                                     f"{settings.stalled_after} iterations")  # fmt: skip
+            lost = _is_lost(problem, state) or watch.reason(problem, state.latents, state.lost, state.iteration)
+            if lost:
+                _say_diverged(state, lost)
                 return DIVERGED
             state.iteration += 1
             if state.iteration % settings.checkpoint_every == 0:
@@ -158,6 +158,20 @@ def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float]
             if progress is not None:
                 progress(state.iteration, settings.iterations, _note(problem, state, losses))
     return FINISHED
+
+
+def _is_lost(problem: Problem, state: _State) -> str:
+    """What the losses and gradients say against going on, or ""."""
+    history, patience = state.history, problem.settings.stalled_after
+    if history.diverges(problem.settings.diverged_factor):
+        return f"the loss diverged (now {history.recent[-1]:.3e}, at first {history.scale:.3e})"
+    if history.regressed:
+        return (f"the loss has been above the first ones for {history.above} iterations (now {history.mean:.3e}) and "
+                f"was {history.best_loss:.3e} before")  # fmt: skip
+    broken = [name for name, norm in state.norms.items() if not math.isfinite(norm)]
+    if any(state.lost[name] >= patience for name in broken):
+        return f"the gradient of {', '.join(broken)} has not been finite for {patience} iterations"
+    return ""
 
 
 def _note(problem: Problem, state: _State, losses: list[float]) -> str:
@@ -227,16 +241,16 @@ def _checkpoint(problem: Problem, state: _State) -> Checkpoint:
 
 
 def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
-    """One step of every optimiser; the loss before it."""
+    """One step of every optimiser, from where the scene stands; the loss before it."""
     start = time.perf_counter()
     before = copied(state.latents)
-    problem.apply(state.latents)
     loss, images = problem.evaluate(state.iteration)
     state.history.add(loss, before)
     rate = problem.rate(state.iteration)
     state.norms = {}
     for name, variable in problem.variables.items():
         _step(problem, state, name, variable, rate)
+    problem.apply(state.latents)
     journal.step(
         state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
         problem.offsets(before),

@@ -165,9 +165,9 @@ def make_problem(
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:
         for latent, rate in variable.learning_rates.items():
-            if not rate > 0:
+            if not 0 < rate < np.inf:
                 raise OptionError(
-                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
+                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0 and finite, got {rate}"
                 )
     if not hasattr(integrator, "render_backward"):
         integrator = integrators.build(integrators.integrator_spec(scene, integrator))
