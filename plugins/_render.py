@@ -9,6 +9,7 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from psdr_jit import film as films
 from psdr_jit.batch import parts_of, share, side_by_side, splits
 from psdr_jit.errors import ParameterError
+from psdr_jit.integrators import require_samples
 from psdr_jit.options import Options
 from psdr_jit.plan import Plan
 from psdr_jit.planning import Call, Prepared, prepare
@@ -36,6 +37,7 @@ class TermIntegrator(ADIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         view = find_sensor(scene, sensor)
+        require_samples(view, spp)
         if not splits(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)

@@ -64,6 +64,7 @@ class CentralDifference:
         self.integrator = integrators.reference(spec)
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
+        integrators.require_samples(self.sensor, self.spp)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
         self.primal = GroupedImages(groups=1)
         self.seconds = 0.0

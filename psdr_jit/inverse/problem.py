@@ -161,6 +161,8 @@ def make_problem(
     if twice:
         raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
     found = tuple(views(scene, targets))
+    for view in found:
+        integrators.require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
     params = mi.traverse(scene)
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:
