@@ -47,5 +47,9 @@ class CheckpointError(PsdrError, RuntimeError):
     """The state of an optimisation cannot be written or read."""
 
 
+class LockedError(PsdrError, RuntimeError):
+    """Another run is at work in the folder."""
+
+
 class StalledWarning(UserWarning):
     """A variable has had no gradient for several iterations; the message says why."""

@@ -50,10 +50,15 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"{error}; the checkpoint before it is intact") from error
 
 
-def load(path: Path, fingerprint: str) -> Checkpoint:
-    """Raises `CheckpointError` unless there is a complete one of the same problem."""
+def require(path: Path) -> None:
+    """Raise `CheckpointError` unless there is one."""
     if not path.is_file():
         raise CheckpointError(f"there is no checkpoint '{path}' to resume from; start without resuming")
+
+
+def load(path: Path, fingerprint: str) -> Checkpoint:
+    """Raises `CheckpointError` unless there is a complete one of the same problem."""
+    require(path)
     try:
         with np.load(path) as file:
             header = json.loads(str(file["header"]))

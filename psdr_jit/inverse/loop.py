@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,9 +15,11 @@ import numpy as np
 
 from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
+from psdr_jit.inverse import lock
 from psdr_jit.inverse.checkpoint import Checkpoint
 from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
+from psdr_jit.inverse.interruption import interruptible
 from psdr_jit.inverse.journal import Journal
 from psdr_jit.inverse.problem import Latents, Problem, copied
 from psdr_jit.inverse.variables import like, numbers
@@ -73,6 +72,14 @@ def run(
 ) -> Result:
     """Optimise; with a `folder`, log there, checkpoint, and `resume` from it. See `psdr_jit.optimize`."""
     require_folder(folder, resume)
+    if folder is None:
+        return _run(problem, None, False, progress)
+    with lock.held(folder):
+        require_folder(folder, resume, mine=True)  # a run may have ended here in between
+        return _run(problem, folder, resume, progress)
+
+
+def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> Result:
     state = _begin(problem)
     if resume:
         _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
@@ -100,10 +107,17 @@ def run(
     return result
 
 
-def require_folder(folder: Path | None, resume: bool) -> None:
-    """Raise `OptionError` if there is nothing to resume from, or an earlier run that would be overwritten."""
+def require_folder(folder: Path | None, resume: bool, mine: bool = False) -> None:
+    """Raise typed errors if there is nothing to resume from, a run that would be overwritten, or one at work there.
+
+    `mine`: its lock is held by the caller.
+    """
     if resume and folder is None:
         raise OptionError("resuming needs the folder of the run that was interrupted")
+    if folder is not None and not mine:
+        lock.require_free(folder)
+    if resume:
+        checkpoints.require(folder / checkpoints.NAME)
     if not resume and folder is not None and (folder / checkpoints.NAME).exists():
         raise OptionError(
             f"'{folder}' holds an earlier run: go on with it by resuming (--resume), choose another folder (--out), or "
@@ -141,7 +155,7 @@ def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float]
     settings = problem.settings
     problem.apply(state.latents)
     watch = Watch(problem)
-    with _interruptible() as interrupted:
+    with interruptible() as interrupted:
         while state.iteration < settings.iterations:
             if interrupted:
                 return INTERRUPTED
@@ -186,25 +200,6 @@ def _say_diverged(state: _State, what: str) -> None:
     known = f"the best state (loss {best:.3e})" if math.isfinite(best) else "the start"
     said = f"{what} at iteration {state.iteration}: stopped, {known} is kept; lower the learning rates, or raise spp"
     warnings.warn(said, RuntimeWarning, stacklevel=5)
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C fills the list instead of stopping between two variables of a step; pressed again, it stops at once."""
-    seen: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        seen.append(number)
-        signal.signal(signal.SIGINT, before)
-
-    if threading.current_thread() is not threading.main_thread():  # only that one receives signals
-        yield seen
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield seen
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _begin(problem: Problem) -> _State:
