@@ -37,8 +37,9 @@ RANK = {
     # plugins and the tools on top of them
     "pilot": 10, "noise_log": 11, "integrators": 10, "planning": 12, "plugins": 13,
     "gradient": 14, "finite_differences": 14,
-    "check": 15, "demo": 15, "inverse": 15,
-    "cli": 16,
+    "check": 15, "inverse": 15,
+    "demo": 16,
+    "cli": 17,
 }  # fmt: skip
 """Stage of each module or package; an import must lead to a lower one, or stay within a package."""
 
