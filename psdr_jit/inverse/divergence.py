@@ -48,9 +48,9 @@ class Watch:
                 if not size <= LARGEST * self.sizes[name]:
                     grown = f"has grown to {size:.0e}" if math.isfinite(size) else "is not finite"
                     return f"{name} ({latent}) {grown}"
-            counts = [lost[f"{name} ({latent})"] for latent in found]
+            count = min((lost[f"{name} ({latent})"] for latent in found), default=0)
             patience = 2 * problem.settings.stalled_after * problem.period
-            stalled = patience <= min(counts) <= iteration  # and has had a gradient before
+            stalled = patience <= count <= iteration  # and has had a gradient before
             nearest, farthest = self._distances(problem, name)
             if not farthest <= FAR or (stalled and nearest > 0):
                 where = f"{name} has left the scene, by {farthest:.2g} times its size"
@@ -73,7 +73,8 @@ def _points(problem: Problem, name: str) -> np.ndarray | None:
         return _origin(value) if value.matrix.shape[0] == 4 else None
     if not name.endswith(("position", "positions")):
         return None
-    return numbers(value).reshape(-1, 3)
+    found = numbers(value)
+    return found.reshape(-1, 3) if found.size % 3 == 0 else None
 
 
 def _origin(pose: Any) -> np.ndarray:

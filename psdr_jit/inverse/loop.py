@@ -37,9 +37,9 @@ class Result:
     status: str  # "finished", "out of time", "diverged" or "interrupted"
     iterations: int  # that have been done, in all runs together
     seconds: float  # of all runs together, without reading and checking the problem
-    losses: list[float]  # by iteration of this run, before its step
+    losses: list[float] = field(repr=False)  # by iteration of this run, before its step
     loss: float  # mean of the last few; NaN without any
-    latents: Latents  # detached
+    latents: Latents = field(repr=False)  # detached
     offsets: dict[str, dict[str, float]]  # from the scene's own values, now ...
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
     not_written: list[str] = field(default_factory=list)  # what the disk did not take ...
@@ -153,8 +153,9 @@ class Stepper:
 def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float], progress: Any) -> str:
     """Iterate until there is a reason to stop, and return it."""
     settings = problem.settings
+    problem.apply(problem.start())
+    watch = Watch(problem)  # of where the run began, also when it is resumed
     problem.apply(state.latents)
-    watch = Watch(problem)
     with interruptible() as interrupted:
         while state.iteration < settings.iterations:
             if interrupted:

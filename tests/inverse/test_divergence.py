@@ -49,6 +49,15 @@ def test_a_body_that_never_had_a_gradient_is_only_warned_about(llvm):
     assert result.status == "finished"
 
 
+def test_a_resumed_run_remembers_where_the_scene_was(llvm, tmp_path):
+    """Not far enough to be noticed before the interruption; what is far is measured from the start all the same."""
+    problem = problem_of([Pose(BOX, 2.5e3, **START)], iterations=2, stalled_after=100)
+    loop.run(problem, tmp_path)
+    with pytest.warns(RuntimeWarning, match="has left the scene, by 1"):
+        problem = problem_of([Pose(BOX, 2.5e3, **START)], iterations=40, stalled_after=100)
+        assert loop.run(problem, tmp_path, resume=True).status == "diverged"
+
+
 def test_exit_status_and_what_is_kept(llvm, tmp_path, capsys):
     config = write_config(tmp_path, 20, **{"learning_rate = 0.02": "learning_rate = 1e30"})
     assert main.main(["optimize", str(config), "--out", str(tmp_path / "out")]) == 1
