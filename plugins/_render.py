@@ -9,6 +9,7 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from psdr_jit.core import film as films
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
+from psdr_jit.derivative.integrator_specs import require_samples
 from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
@@ -39,6 +40,7 @@ class TermIntegrator(ADIntegrator):
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         view = find_sensor(scene, sensor)
+        require_samples(view, spp)
         if not splits(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)

@@ -39,8 +39,16 @@ class UnsupportedWarning(UserWarning):
     """A part of the derivative is not modelled; the message names it."""
 
 
+class StorageError(PsdrError, OSError):
+    """The disk did not take a file: it is full, over quota, or broken."""
+
+
 class CheckpointError(PsdrError, RuntimeError):
     """The state of an optimisation cannot be written or read."""
+
+
+class LockedError(PsdrError, RuntimeError):
+    """Another run is at work in the folder."""
 
 
 class StalledWarning(UserWarning):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
 
@@ -64,8 +64,8 @@ class CheckResult:
     terms: tuple[str, ...]
     param: str
     direction: str
-    estimate: np.ndarray    # mean derivative image, (H, W, C)
-    reference: np.ndarray
+    estimate: np.ndarray = field(repr=False)    # mean derivative image, (H, W, C)
+    reference: np.ndarray = field(repr=False)
 
     @property
     def passed(self) -> bool:

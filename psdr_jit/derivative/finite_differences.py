@@ -64,6 +64,7 @@ class CentralDifference:
         self.integrator = integrator_specs.reference(spec)
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
+        integrator_specs.require_samples(self.sensor, self.spp)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
         self.primal = GroupedImages(groups=1)
         self.seconds = 0.0

@@ -161,13 +161,15 @@ def make_problem(
     if twice:
         raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
     found = tuple(views(scene, targets))
+    for view in found:
+        integrator_specs.require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
     params = mi.traverse(scene)
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:
         for latent, rate in variable.learning_rates.items():
-            if not rate > 0:
+            if not 0 < rate < np.inf:
                 raise OptionError(
-                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
+                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0 and finite, got {rate}"
                 )
     if not hasattr(integrator, "render_backward"):
         integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, integrator))

@@ -69,6 +69,10 @@ def _cause(error: Exception) -> str:
     """What Mitsuba says, without its source lines; what one of our plugins says, without Python's traceback."""
     own = re.findall(r"\b(?:Parameter|Option|Scene|Unsupported)Error: (.*)", str(error))
     text = own[-1] if own else " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
+    if "include recursion depth" in text:
+        files = re.findall(r"Error while loading (.*?) \(line", text)
+        around = files[: files.index(files[0], 1) + 1] if files[0] in files[1:] else files
+        return f"its <include>s do not end ({' includes '.join(around)}); remove one of them"
     if 'Plugin "psdr_' in text and "_ad_" not in mi.variant():
         return f"its integrator needs derivatives, which {mi.variant()} does not track; use {DEFAULT_VARIANT}"
     return text
