@@ -33,6 +33,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .params import ParamInfo, differentiable_params
     from .plan import Plan
     from .planning import make_plan
+    from .scene_names import traverse
 
     __all__ = [
         "CheckResult",
@@ -48,4 +49,5 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "gradient",
         "make_plan",
         "optimize",
+        "traverse",
     ]

@@ -17,6 +17,7 @@ import numpy as np
 
 from psdr_jit.errors import ParameterError, SceneError
 from psdr_jit.params import ParamInfo, find_param, is_transform, values_to_keep
+from psdr_jit.scene_names import traverse
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,9 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
                          "load one with mi.load_file")
-    params = mi.traverse(scene)
+    params = traverse(scene)
     info = find_param(scene, name, params)
+    name = info.name
     _require_faces(params.properties[name][2])
     if index is not None and (isinstance(index, bool) or not isinstance(index, Integral)):
         raise ParameterError(f"index must be a whole number, got {index!r}")

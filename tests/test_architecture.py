@@ -20,7 +20,7 @@ RANK = {
     "private_apt": 0, "ply": 0, "edge_distribution": 0, "analytic_edges": 0, "streams": 0, "scattering": 0,
     "low_discrepancy": 0, "rejected": 0, "upload": 0,
     # host-side descriptions
-    "compat": 1, "options": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
+    "compat": 1, "options": 1, "scene_names": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "llvm_fetch": 1, "scene_io": 1,
     "params": 2, "scene_probes": 3, "batch": 4,
     "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,

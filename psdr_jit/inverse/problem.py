@@ -19,6 +19,7 @@ from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
 from psdr_jit.inverse.variables import Variable
 from psdr_jit.params import is_transform, parameter_value
+from psdr_jit.scene_names import stable_name, traverse
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
 
@@ -157,11 +158,12 @@ def make_problem(
     names = [v.parameter for v in chosen]
     if not chosen:
         raise OptionError("there is no variable: name at least one scene parameter to optimise")
-    twice = sorted({name for name in names if names.count(name) > 1})
+    keys = [stable_name(scene, name) for name in names]
+    twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
         raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
     found = tuple(views(scene, targets))
-    params = mi.traverse(scene)
+    params = traverse(scene, names)
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:
         for latent, rate in variable.learning_rates.items():
