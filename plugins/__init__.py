@@ -11,12 +11,15 @@ import sys
 
 import mitsuba as mi
 
+from psdr_jit.llvm_guard import require_working_llvm, warn_without_backend
+
 _PLUGINS = ("psdr_path",)
 
 
 def _register(_old: str | None, variant: str | None) -> None:
     if variant is None or "_ad_" not in variant:
         return  # no derivatives in this variant, hence nothing to register
+    require_working_llvm(variant)
     base = importlib.import_module("mitsuba.ad.integrators.common")
     if not issubclass(base.ADIntegrator, mi.Integrator):
         importlib.reload(base)  # our base class still belongs to the variant it was first imported in
@@ -28,5 +31,6 @@ def _register(_old: str | None, variant: str | None) -> None:
             importlib.import_module(full)
 
 
+warn_without_backend()
 mi.detail.add_variant_callback(_register)
 _register(None, mi.variant())

@@ -12,7 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.errors import OptionError, SceneError, SetupError
+from psdr_jit.errors import OptionError, PsdrError, SceneError, SetupError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -31,6 +31,8 @@ def use_variant(name: str) -> None:
         raise OptionError(f"this Mitsuba has no variant '{name}'; it has {', '.join(mi.variants())}")
     try:
         mi.set_variant(name)
+    except PsdrError:
+        raise           # says what to do
     except (ImportError, RuntimeError) as error:
         if (getattr(error, "name", None) or "").startswith("psdr_jit"):
             raise   # a module of ours is missing: a defect, not a matter of set-up

@@ -25,7 +25,7 @@ RANK = {
     "params": 2, "scene_probes": 3, "batch": 4,
     "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
     "intersections": 2, "walk_tangents": 2, "perturbation": 3, "llvm": 2,
-    "scene_analysis": 4, "interior": 6, "drjit_libraries": 3,
+    "scene_analysis": 4, "interior": 6, "drjit_libraries": 3, "llvm_guard": 3,
     "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "forms": 5, "trial": 5,
     "job": 6,
     "edge_rows": 2, "junctions": 6, "junction_points": 7, "shape_pairs": 3,
