@@ -87,6 +87,8 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
       bounding box, or about its own origin for a sensor or a lamp;
     - `index=i`: one scalar of the parameter in flat order;
     - otherwise `direction` is one number, or as many as the parameter has scalars; default: all ones.
+
+    Numbers come as sequences, NumPy or Dr.Jit arrays.
     """
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
@@ -127,8 +129,12 @@ def _is_full_direction(direction: Any, base: Any) -> bool:
 
 
 def _numbers(values: Any, what: str) -> np.ndarray:
+    """One dimension, float64, in the flat order of parameters: x y z x y z ... of a `mi.Vector3f`, too."""
+    if dr.is_array_v(values):
+        array = np.array(dr.detach(values), dtype=np.float64)
+        values = array.T if dr.depth_v(values) == 2 and not dr.is_tensor_v(values) else array
     try:
-        array = np.asarray(values, dtype=np.float64)
+        array = np.asarray(values, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
         raise ParameterError(f"{what} must be made of numbers, got {values!r}") from error
     if not np.all(np.isfinite(array)) or not np.any(array):
@@ -143,7 +149,7 @@ def _motion(common: dict, base: Any, direction: Any, rotate: Any) -> Perturbatio
         raise ParameterError(f"'{name}' needs a direction: direction=(dx, dy, dz) or rotate=(ax, ay, az) "
                              "(--direction / --rotate on the command line)")
     vector = _numbers(direction if rotate is None else rotate, "the direction of motion")
-    if vector.shape != (3,):
+    if vector.size != 3:
         raise ParameterError(f"the direction of '{name}' must have 3 numbers, got {vector.size}")
     centre, extent = _pivot(common, base)
     length = float(np.linalg.norm(vector))
@@ -196,7 +202,7 @@ def _addition(common: dict, base: Any, direction: Any, index: int | None) -> Per
     elif direction is None:
         flat, label = np.ones(size), "all scalars by the same amount" if size > 1 else "its value"
     else:
-        flat, label = _numbers(direction, "the direction").ravel(), "a given direction"
+        flat, label = _numbers(direction, "the direction"), "a given direction"
         if flat.size not in (1, size):
             raise ParameterError(f"the direction of '{name}' must have 1 or {size} numbers, got {flat.size}")
         flat = np.broadcast_to(flat, (size,))
