@@ -14,6 +14,7 @@ from psdr_jit.plan import Plan
 from psdr_jit.planning import Call, Prepared, prepare
 from psdr_jit.rejected import Rejected
 from psdr_jit.scene_io import find_sensor
+from psdr_jit.threads import alone
 
 
 class TermIntegrator(ADIntegrator):
@@ -57,9 +58,10 @@ class TermIntegrator(ADIntegrator):
         if splits(view):
             parts = parts_of(view, seed, spp)
             return side_by_side([self.render_forward(scene, params, p.sensor, p.seed, p.spp) for p in parts])
-        prepared = self._prepared(scene, sensor, seed, spp, "forward")
-        images = {term.name: term.forward(job) for term, job in prepared.jobs}
-        prepared.observe(seed, images)
+        with alone():
+            prepared = self._prepared(scene, sensor, seed, spp, "forward")
+            images = {term.name: term.forward(job) for term, job in prepared.jobs}
+            prepared.observe(seed, images)
         return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
@@ -70,11 +72,12 @@ class TermIntegrator(ADIntegrator):
             for k, p in enumerate(parts):
                 self.render_backward(scene, params, share(grad_in, k, len(parts)), p.sensor, p.seed, p.spp)
             return
-        prepared = self._prepared(scene, sensor, seed, spp, "backward")
-        _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
-        for term, job in prepared.jobs:
-            term.backward(job, grad_in)
-        dr.eval()
+        with alone():
+            prepared = self._prepared(scene, sensor, seed, spp, "backward")
+            _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
+            for term, job in prepared.jobs:
+                term.backward(job, grad_in)
+            dr.eval()
 
     def to_string(self):
         return f"{type(self).__name__}[{self.options}]"

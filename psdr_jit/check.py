@@ -23,6 +23,7 @@ from psdr_jit.gradient import DerivativeSampler, differentiable
 from psdr_jit.options import require_count
 from psdr_jit.perturbation import Perturbation, perturb
 from psdr_jit.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
+from psdr_jit.threads import one_at_a_time
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 
@@ -153,6 +154,7 @@ def _judge_zero(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: i
     return outcome
 
 
+@one_at_a_time
 def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
                    index: int | None = None, integrator: Any = None, spp: int = 64, sensor: int = 0,
                    eps: float | None = None, reference_spp: int | None = None, block: int | None = None,

@@ -18,6 +18,7 @@ from psdr_jit.options import require_count
 from psdr_jit.perturbation import Perturbation, perturb
 from psdr_jit.scene_io import find_sensor
 from psdr_jit.statistics import GroupedImages
+from psdr_jit.threads import one_at_a_time
 
 MAX_GROUPS = 64     # images kept for the standard errors; more seeds share a group
 
@@ -92,6 +93,7 @@ class DerivativeSampler:
         self.seconds += time.perf_counter() - start
 
 
+@one_at_a_time
 def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
              index: int | None = None, integrator: Any = None, spp: int = 64, seeds: int = 8, sensor: int = 0,
              progress: Callable[[int, int], None] | None = None) -> GradientResult:

@@ -33,6 +33,7 @@ from .scene_analysis import SceneFacts, analyse
 from .scene_checks import require_supported, warn_about_missing_terms
 from .scene_io import find_sensor
 from .terms import TERMS, Term
+from .threads import one_at_a_time
 from .trial import trial_of
 from .velocities import facts_along_tangents
 
@@ -190,6 +191,7 @@ def _best_form(measured: Measurement, spp: int, single: tuple[str, str]) -> tupl
     return best, f"{work[worst] / work[best]:.2g} times less variance x cost than {worst}, by a pilot"
 
 
+@one_at_a_time
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
     """What differentiating `scene` by the parameters with gradients enabled would do.
 

@@ -14,8 +14,10 @@ from psdr_jit.inverse import loop
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.variables import Variable
+from psdr_jit.threads import one_at_a_time
 
 
+@one_at_a_time
 def optimize(
     scene: mi.Scene,
     variables: Variable | Sequence[Variable],
