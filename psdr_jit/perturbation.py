@@ -181,12 +181,13 @@ def _pivot(common: dict, base: Any) -> tuple[tuple[float, ...], float]:
     if is_transform(base):
         if isinstance(node, mi.Shape):
             box = node.bbox()
-            return tuple(float(c) for c in box.center()), float(np.linalg.norm(np.array(box.extents())))
+            extents = np.array(box.extents(), dtype=np.float64)  # whose squares may exceed single precision
+            return tuple(float(c) for c in box.center()), float(np.linalg.norm(extents))
         origin = np.array(base @ mi.Point3f(0)).ravel()
         return tuple(float(c) for c in origin), 0.0
     if isinstance(base, mi.Point3f):
         return tuple(float(c) for c in np.array(base).ravel()), 0.0
-    points = np.array(base).reshape(-1, 3)
+    points = np.array(base, dtype=np.float64).reshape(-1, 3)
     lo, hi = points.min(0), points.max(0)
     return tuple(float(c) for c in (lo + hi) / 2), float(np.linalg.norm(hi - lo))
 

@@ -82,7 +82,7 @@ def prepare(call: Call) -> Prepared:
     budgets = _budgets(call)
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
-    require_supported(facts)
+    require_supported(facts, call.cache)
     warn_about_missing_terms(facts, [term.name for term in TERMS], call.options.depth_limit, call.cache)
     shared: dict = {}
     plan, log = _plan(call, facts, budgets, shared)

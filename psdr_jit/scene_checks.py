@@ -15,10 +15,9 @@ from .compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
 from .errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
 from .mesh_edges import EdgeTopology
 from .scene_analysis import SceneFacts, ShapeFacts
+from .scene_size import loss_by_offsets, overflow
 from .support import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
-
-SMALL_SCENE = 0.1
-"""Diagonal [scene units] below which the primary term loses more than 0.2 % (measured on a lit box)."""
+from .warn_once import warn_once
 
 BOUNDARY_TERMS = {
     "direct": (2, "moving shadows of the light sources"),
@@ -40,10 +39,11 @@ class Finding:
         return issubclass(self.category, PsdrError)
 
 
-def require_supported(facts: SceneFacts) -> None:
+def require_supported(facts: SceneFacts, said: dict | None = None) -> None:
     """Raise if the derivative of this scene would be wrong, warn if a part of it is missing.
 
-    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter.
+    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter;
+    `said` remembers, per caller, which parts have been missed already.
     """
     found = list(findings(facts))
     errors = [finding for finding in found if finding.is_error]
@@ -51,7 +51,7 @@ def require_supported(facts: SceneFacts) -> None:
         text = "\n".join(f"- {error.message}" for error in errors) if len(errors) > 1 else errors[0].message
         raise errors[0].category(text if len(errors) == 1 else f"{len(errors)} obstacles:\n{text}")
     for finding in found:
-        warnings.warn(finding.message, finding.category, stacklevel=2)
+        warn_once(finding.message, finding.category, said if finding.category is UnsupportedWarning else None)
 
 
 def findings(facts: SceneFacts) -> Iterator[Finding]:
@@ -189,11 +189,10 @@ def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_extent(facts: SceneFacts) -> Iterator[Finding]:
-    """Mitsuba keeps rays off surfaces by 1e-4 (1 + coordinates), and edges of that size blur."""
-    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE * max(1, facts.reach):
-        text = (f"the scene is only {facts.extent:.2g} units across, up to {facts.reach:.2g} from the origin: "
-                "Mitsuba's ray offsets swallow a part of the derivative (1 % at 0.03, 9 % at 0.003 units across); "
-                "scale the scene up, or move it to the origin")  # fmt: skip
+    """Single precision: what is too large overflows, what is small or far away loses a part to ray offsets."""
+    if text := overflow(facts):
+        yield Finding(SceneError, "", text)
+    elif facts.geometry_moves and (text := loss_by_offsets(facts)):
         yield Finding(UnsupportedWarning, "", text)
 
 
@@ -277,9 +276,7 @@ def warn_about_missing_terms(facts: SceneFacts, terms: Iterable[str], depth_limi
         "boundary terms do not exist yet. psdr_jit.check_gradient (psdr gradient --check) tells how much that is; "
         "with max_depth=1 it is nothing"
     )
-    if message not in said.setdefault("missing terms", set()):
-        said["missing terms"].add(message)
-        warnings.warn(message, UnsupportedWarning, stacklevel=2)
+    warn_once(message, UnsupportedWarning, said)
 
 
 def warn_about_mesh(name: str, topology: EdgeTopology) -> None:

@@ -18,7 +18,7 @@ RANK = {
     # nothing of ours below
     "errors": 0, "ad": 0, "support": 0, "records": 0, "statistics": 0, "system_advice": 0, "llvm_probe": 0,
     "private_apt": 0, "ply": 0, "edge_distribution": 0, "analytic_edges": 0, "streams": 0, "scattering": 0,
-    "low_discrepancy": 0, "rejected": 0, "threads": 1, "upload": 0,
+    "low_discrepancy": 0, "rejected": 0, "threads": 1, "warn_once": 0, "upload": 0,
     # host-side descriptions
     "compat": 1, "options": 1, "scene_names": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "llvm_fetch": 1, "scene_io": 1,
@@ -26,7 +26,7 @@ RANK = {
     "edge_geometry": 2, "mesh_shells": 2, "sensor_frame": 2, "path_records": 2, "touch": 2,
     "intersections": 2, "walk_tangents": 2, "perturbation": 3, "llvm": 2,
     "scene_analysis": 4, "interior": 6, "drjit_libraries": 3, "llvm_guard": 3,
-    "scene_checks": 5, "plan": 5, "velocities": 5, "convexity": 5, "forms": 5, "trial": 5,
+    "scene_checks": 6, "scene_size": 5, "plan": 5, "velocities": 5, "convexity": 5, "forms": 5, "trial": 5,
     "job": 6,
     "edge_rows": 2, "junctions": 6, "junction_points": 7, "shape_pairs": 3,
     "edge_set": 7,
