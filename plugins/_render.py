@@ -13,6 +13,7 @@ from psdr_jit.options import Options
 from psdr_jit.plan import Plan
 from psdr_jit.planning import Call, Prepared, prepare
 from psdr_jit.rejected import Rejected
+from psdr_jit.scene_guard import require_integrator
 from psdr_jit.scene_io import find_sensor
 from psdr_jit.threads import alone
 
@@ -36,6 +37,7 @@ class TermIntegrator(ADIntegrator):
         )
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
         if not splits(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
@@ -54,6 +56,7 @@ class TermIntegrator(ADIntegrator):
         return prepared
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
         if splits(view):
             parts = parts_of(view, seed, spp)
@@ -65,6 +68,7 @@ class TermIntegrator(ADIntegrator):
         return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
         if splits(view):
             _require_gradient_image(grad_in, films.black(view.film()).shape)

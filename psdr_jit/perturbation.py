@@ -15,8 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.errors import ParameterError, SceneError
+from psdr_jit.errors import ParameterError
 from psdr_jit.params import ParamInfo, find_param, is_transform, values_to_keep
+from psdr_jit.scene_guard import require_scene
 from psdr_jit.scene_names import traverse
 
 
@@ -90,13 +91,10 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
 
     Numbers come as sequences, NumPy or Dr.Jit arrays.
     """
-    if not isinstance(scene, mi.Scene):
-        raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
-                         "load one with mi.load_file")
+    require_scene(scene)
     params = traverse(scene)
     info = find_param(scene, name, params)
     name = info.name
-    _require_faces(params.properties[name][2])
     if index is not None and (isinstance(index, bool) or not isinstance(index, Integral)):
         raise ParameterError(f"index must be a whole number, got {index!r}")
     if sum(x is not None for x in (direction, rotate, index)) > 1:
@@ -113,12 +111,6 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     if info.shape in ((4, 4), (3, 3)):
         raise ParameterError(f"'{name}' is a transform: give direction=(dx, dy, dz) or rotate=(ax, ay, az)")
     return _addition(common, base, direction, index)
-
-
-def _require_faces(node: Any) -> None:
-    """Mitsuba fails to update a mesh without faces."""
-    if isinstance(node, mi.Mesh) and node.face_count() == 0:
-        raise SceneError(f"mesh '{node.id()}' has no faces; remove it or fix its file")
 
 
 def _is_full_direction(direction: Any, base: Any) -> bool:

@@ -31,6 +31,7 @@ from .plan import EdgeCount, Geometry, Plan
 from .rejected import Rejected
 from .scene_analysis import SceneFacts, analyse
 from .scene_checks import require_supported, warn_about_missing_terms
+from .scene_guard import require_derivatives
 from .scene_io import find_sensor
 from .terms import TERMS, Term
 from .threads import one_at_a_time
@@ -201,6 +202,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
     what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what rendering would raise:
     `OptionError`, `SceneError`, `UnsupportedError`.
     """
+    require_derivatives()
     view = find_sensor(scene, sensor)
     if not hasattr(integrator, "call"):
         integrator = build(integrator_spec(scene, integrator))

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .errors import UnsupportedError
+from .scene_guard import require_derivatives
 from .scene_probes import (
     SceneGraph,
     blends_delta,
@@ -169,10 +169,7 @@ def analyse(
     suspended (`dr.suspend_grad`) are enabled. Costs milliseconds and one synchronisation, so it can be repeated
     whenever parameters change.
     """
-    if not dr.is_diff_v(mi.Float):
-        raise UnsupportedError(
-            f"variant '{mi.variant()}' does not track derivatives; use mi.set_variant('llvm_ad_rgb')"
-        )
+    require_derivatives()
     with dr.resume_grad():
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         graph = SceneGraph(scene, sensor, counts)

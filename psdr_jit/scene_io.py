@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.errors import OptionError, PsdrError, SceneError, SetupError
+from psdr_jit.scene_guard import require_scene, require_variant
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -70,10 +71,7 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
 def _cause(error: Exception) -> str:
     """What Mitsuba says, without its source lines; what one of our plugins says, without Python's traceback."""
     own = re.findall(r"\b(?:Parameter|Option|Scene|Unsupported)Error: (.*)", str(error))
-    text = own[-1] if own else " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
-    if 'Plugin "psdr_' in text and "_ad_" not in mi.variant():
-        return f"its integrator needs derivatives, which {mi.variant()} does not track; use {DEFAULT_VARIANT}"
-    return text
+    return own[-1] if own else " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
 
 
 def integrator_properties(path: str | os.PathLike, **defaults: Any) -> dict[str, Any]:
@@ -101,8 +99,8 @@ def check_sensor(scene: Any, index: int) -> None:
 
 def find_sensor(scene: Any, sensor: Any) -> Any:
     """The sensor itself, or the one with this index; a typed error if there is none."""
-    if not isinstance(scene, mi.Scene):
-        raise SceneError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    require_scene(scene)
+    require_variant(sensor, "the sensor")
     if isinstance(sensor, mi.Sensor):
         return sensor
     count = len(scene.sensors())

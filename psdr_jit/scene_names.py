@@ -13,6 +13,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from psdr_jit.scene_guard import require_variant
+
 ADDRESS = re.compile(r"(object_\d+|_unnamed_\d+)(_\d+)?")
 """What Mitsuba calls objects without an id: `object_94174662291344`."""
 
@@ -23,6 +25,7 @@ def traverse(scene: Any, spellings: Iterable[str] = ()) -> Any:
     `spellings`: other accepted names of parameters, such as `shape[0].to_world` of a shape that has an id. The object
     that such a name belongs to is found under its spelling as well.
     """
+    require_variant(scene, "the scene")
     params = mi.traverse(scene)
     objects = _scene_objects(params)
     prefixes = _stable(objects)

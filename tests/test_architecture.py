@@ -16,9 +16,9 @@ MAX_LINES = 300
 
 RANK = {
     # nothing of ours below
-    "errors": 0, "ad": 0, "support": 0, "records": 0, "statistics": 0, "system_advice": 0, "llvm_probe": 0,
+    "errors": -1, "ad": 0, "support": 0, "records": 0, "statistics": 0, "system_advice": 0, "llvm_probe": 0,
     "private_apt": 0, "ply": 0, "edge_distribution": 0, "analytic_edges": 0, "streams": 0, "scattering": 0,
-    "low_discrepancy": 0, "rejected": 0, "threads": 1, "warn_once": 0, "upload": 0,
+    "low_discrepancy": 0, "rejected": 0, "threads": 1, "warn_once": 0, "scene_guard": 0, "upload": 0,
     # host-side descriptions
     "compat": 1, "options": 1, "scene_names": 1, "mesh_edges": 1, "film": 1, "path_steps": 1, "images": 1,
     "llvm_fetch": 1, "scene_io": 1,

@@ -19,6 +19,7 @@ from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
 from psdr_jit.inverse.variables import Variable
 from psdr_jit.params import is_transform, parameter_value
+from psdr_jit.scene_guard import require_derivatives, require_integrator, require_scene
 from psdr_jit.scene_names import stable_name, traverse
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
@@ -152,8 +153,8 @@ def make_problem(
     settings: Settings,
 ) -> Problem:
     """Everything checked; raises typed errors before anything is rendered in a loop."""
-    if not isinstance(scene, mi.Scene):
-        raise ParameterError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    require_derivatives()
+    require_scene(scene)
     chosen = list(variables) if isinstance(variables, Sequence) else [variables]
     names = [v.parameter for v in chosen]
     if not chosen:
@@ -171,6 +172,7 @@ def make_problem(
                 raise OptionError(
                     f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
                 )
+    require_integrator(integrator)
     if not hasattr(integrator, "render_backward"):
         integrator = integrators.build(integrators.integrator_spec(scene, integrator))
     by_name = {v.parameter: v for v in chosen}
