@@ -33,6 +33,7 @@ from .scene_analysis import SceneFacts, analyse
 from .scene_checks import require_supported, warn_about_missing_terms
 from .scene_guard import require_derivatives
 from .scene_io import find_sensor
+from .stale_normals import warn_about_stale_normals
 from .terms import TERMS, Term
 from .threads import one_at_a_time
 from .trial import trial_of
@@ -84,6 +85,8 @@ def prepare(call: Call) -> Prepared:
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
     require_supported(facts, call.cache)
+    if call.mode == "backward":
+        warn_about_stale_normals(call.scene, facts, call.cache)
     warn_about_missing_terms(facts, [term.name for term in TERMS], call.options.depth_limit, call.cache)
     shared: dict = {}
     plan, log = _plan(call, facts, budgets, shared)
