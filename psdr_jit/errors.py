@@ -31,6 +31,10 @@ class SetupError(PsdrError, RuntimeError):
     """The machine lacks something psdr_jit needs, such as a working LLVM."""
 
 
+class SetupWarning(UserWarning):
+    """The machine lacks something that is needed sooner or later; the message says how to get it."""
+
+
 class ZeroDerivativeWarning(UserWarning):
     """The derivative is 0 everywhere; the message says why."""
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages
@@ -113,6 +114,7 @@ class DerivativeSampler:
         self.seconds += time.perf_counter() - start
 
 
+@one_at_a_time
 def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
              index: int | None = None, integrator: Any = None, spp: int = 64, seeds: int = 8, sensor: int = 0,
              progress: Callable[[int, int], None] | None = None) -> GradientResult:

@@ -133,5 +133,9 @@ def to_image(tensor: Any) -> np.ndarray:
 
 
 def _last_line(error: Exception) -> str:
+    """The cause, which Mitsuba puts last; of unknown properties their names."""
+    unknown = re.findall(r'^\s*- \S+ "(\w+)":', str(error), re.MULTILINE)
+    if unknown:
+        return f"it has no property {', '.join(map(repr, unknown))}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else str(error)
