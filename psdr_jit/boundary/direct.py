@@ -94,7 +94,7 @@ def sample(job: Job, edges: SecondaryEdges) -> ShadowLine:
     return ShadowLine(lane, row, t, light, pdf_row, wavelengths, weight)
 
 
-def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment:
+def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment | None:
     """The lines that end on a receiver and on a visible emitter; all others are left out (value 0)."""
     scene, light, on = job.scene, line.light, line.light.on
     active = light.valid & (light.pdf > 0) & dr.any(light.value != 0)
@@ -184,7 +184,6 @@ ESTIMATOR = SecondaryTerm(
     edges=lambda job: secondary_edges(job, NAME, Use.SHADOW),
     sample=sample,
     trace=trace,
-    lanes=lambda segment: dr.width(segment.lane),
     evaluate=evaluate,
 )
 
