@@ -43,7 +43,7 @@ from ..scene.facts import SceneFacts
 from . import segment_motion
 from .light_lines import source_from_curve, source_from_segment
 from .segment_motion import BoundarySamples
-from .sensor_subpath import UNLIMITED_VERTICES, recorded_vertices, subpaths
+from .sensor_subpath import UNLIMITED_VERTICES, Receivers, recorded_vertices, subpaths
 
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
 #: are drawn as make about one path per sample.
@@ -178,17 +178,9 @@ def _prepared(job: Job) -> BoundarySamples | None:
     segment = sample_segments(job, frame, edges)
     if dr.width(segment.row) == 0:
         return None
-    records = subpaths(
-        job,
-        frame,
-        Stream.DIRECT_SUBPATH,
-        segment.lane,
-        segment.receiver,
-        segment.wavelengths,
-        segment.value,
-        -(1 - segment.ratio) * segment.n,
-        longest_subpath(job),
-    )
+    a = -(1 - segment.ratio) * segment.n
+    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value, a)
+    records = subpaths(job, frame, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
     return BoundarySamples(
         table=edges.table,
         at=EdgeLocation(segment.row, segment.t, segment.x, segment.local, mi.Float(0)),

@@ -32,7 +32,7 @@ from ..scene.facts import SceneFacts
 from . import indirect_material, segment_motion
 from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
 from .segment_motion import BoundarySamples
-from .sensor_subpath import SubpathRecords, subpaths
+from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
 
 def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -> mi.Spectrum:
@@ -77,17 +77,8 @@ def _prepared(job: Job) -> BoundarySamples | None:
     if dr.width(view.row) == 0:
         return None
 
-    records = subpaths(
-        job,
-        frame,
-        Stream.INDIRECT_SUBPATH,
-        view.lane,
-        view.receiver,
-        view.wavelengths,
-        view.weight,
-        -view.side,
-        longest_subpath(job),
-    )
+    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.weight, -view.side)
+    records = subpaths(job, frame, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, table, view, records))
     dr.eval(value)
     return BoundarySamples(

@@ -27,7 +27,7 @@ from ..sampling.directions import background_wedges, wedge_measure
 from ..sampling.relevance import SecondaryEdges, secondary_edges
 from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
 from .segment_motion import BoundarySamples
-from .sensor_subpath import SubpathRecords, subpaths
+from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
 #: Share of a resting edge's directions in which movers are behind it; otherwise they are in front.
 AHEAD = 0.5
@@ -89,17 +89,8 @@ def prepared(job: Job) -> BoundarySamples | None:
     if dr.width(b.sign) == 0:
         return None
     v = b.view
-    records = subpaths(
-        job,
-        frame,
-        Stream.INDIRECT_SUBPATH,
-        v.lane,
-        v.receiver,
-        v.wavelengths,
-        v.weight * b.sign,
-        -(1 - b.ratio) * v.side,
-        longest_subpath(job),
-    )
+    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.weight * b.sign, -(1 - b.ratio) * v.side)
+    records = subpaths(job, frame, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)
     return BoundarySamples(

@@ -156,24 +156,7 @@ def _connected(records: SubpathRecords) -> mi.Bool:
     return found
 
 
-def subpaths(
-    job: Job,
-    frame: SensorFrame,
-    stream: Stream,
-    lane: mi.UInt32,
-    receiver: Hit,
-    wavelengths: mi.Color0f,
-    value: mi.Spectrum,
-    a: mi.Vector3f,
-    longest: int,
-) -> SubpathRecords:
-    """`trace_subpaths` of the `Receivers` with these fields."""
-    return trace_subpaths(job, frame, stream, Receivers(lane, receiver, wavelengths, value, a), longest)
-
-
-def trace_subpaths(
-    job: Job, frame: SensorFrame, stream: Stream, receivers: Receivers, longest: int
-) -> SubpathRecords:
+def subpaths(job: Job, frame: SensorFrame, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
     """Walk every receiver x_D back to the sensor, at most `longest` vertices."""
     records = SubpathRecords(dr.width(receivers.lane), longest)
     limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE)
