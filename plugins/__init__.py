@@ -11,12 +11,28 @@ import sys
 
 import mitsuba as mi
 
+from psdr_jit.errors import UnsupportedError
+from psdr_jit.setup.llvm_guard import require_working_llvm, warn_without_backend
+
 _PLUGINS = ("psdr_path",)
 
 
+def _refuse(props: mi.Properties) -> None:
+    """What the plugins are in a variant without derivatives: an error that says so."""
+    raise UnsupportedError(
+        f"'{props.plugin_name()}' computes derivatives, which variant '{mi.variant()}' does not track; use "
+        "llvm_ad_rgb"
+    )
+
+
 def _register(_old: str | None, variant: str | None) -> None:
-    if variant is None or "_ad_" not in variant:
-        return  # no derivatives in this variant, hence nothing to register
+    if variant is None:
+        return
+    if "_ad_" not in variant:
+        for name in _PLUGINS:
+            mi.register_integrator(name, _refuse)
+        return
+    require_working_llvm(variant)
     base = importlib.import_module("mitsuba.ad.integrators.common")
     if not issubclass(base.ADIntegrator, mi.Integrator):
         importlib.reload(base)  # our base class still belongs to the variant it was first imported in
@@ -28,5 +44,6 @@ def _register(_old: str | None, variant: str | None) -> None:
             importlib.import_module(full)
 
 
+warn_without_backend()
 mi.detail.add_variant_callback(_register)
 _register(None, mi.variant())

@@ -9,12 +9,15 @@ from mitsuba.ad.integrators.common import ADIntegrator
 from psdr_jit.core import film as films
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
+from psdr_jit.core.threads import alone
+from psdr_jit.derivative.integrator_specs import require_samples
 from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
 from psdr_jit.plan.call import Call
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.batch_sensor import parts_of, share, side_by_side, splits
+from psdr_jit.scene.guard import require_integrator
 from psdr_jit.scene.io import find_sensor
 
 
@@ -38,7 +41,9 @@ class TermIntegrator(ADIntegrator):
         )
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
+        require_samples(view, spp)
         if not splits(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
@@ -55,16 +60,19 @@ class TermIntegrator(ADIntegrator):
         return prepared
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
         if splits(view):
             parts = parts_of(view, seed, spp)
             return side_by_side([self.render_forward(scene, params, p.sensor, p.seed, p.spp) for p in parts])
-        prepared = self._prepared(scene, sensor, seed, spp, "forward")
-        images = {term.name: term.forward(job) for term, job in prepared.jobs}
-        prepared.observe(seed, images)
+        with alone():
+            prepared = self._prepared(scene, sensor, seed, spp, "forward")
+            images = {term.name: term.forward(job) for term, job in prepared.jobs}
+            prepared.observe(seed, images)
         return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        require_integrator(self)
         view = find_sensor(scene, sensor)
         if splits(view):
             _require_gradient_image(grad_in, films.black(view.film()).shape)
@@ -72,11 +80,12 @@ class TermIntegrator(ADIntegrator):
             for k, p in enumerate(parts):
                 self.render_backward(scene, params, share(grad_in, k, len(parts)), p.sensor, p.seed, p.spp)
             return
-        prepared = self._prepared(scene, sensor, seed, spp, "backward")
-        _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
-        for term, job in prepared.jobs:
-            term.backward(job, grad_in)
-        dr.eval()
+        with alone():
+            prepared = self._prepared(scene, sensor, seed, spp, "backward")
+            _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
+            for term, job in prepared.jobs:
+                term.backward(job, grad_in)
+            dr.eval()
 
     def to_string(self):
         return f"{type(self).__name__}[{self.options}]"

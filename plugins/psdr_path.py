@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from psdr_jit.errors import PsdrError
+
 from ._render import TermIntegrator
 
 
@@ -55,4 +57,12 @@ class PathSpaceIntegrator(TermIntegrator):
     """
 
 
-mi.register_integrator("psdr_path", lambda props: PathSpaceIntegrator(props))
+def _make(props: mi.Properties) -> PathSpaceIntegrator:
+    """Mitsuba prints all frames that an error has passed through: as few as possible."""
+    try:
+        return PathSpaceIntegrator(props)
+    except PsdrError as error:
+        raise error.with_traceback(None) from None
+
+
+mi.register_integrator("psdr_path", _make)

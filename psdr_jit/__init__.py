@@ -35,6 +35,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .inverse.variables import Parameter, Pose
     from .plan.plan import Plan
     from .scene import io as scene_io  # the name by which scenes are loaded: psdr_jit.scene_io.load_scene
+    from .scene.names import traverse
     from .scene.params import ParamInfo, differentiable_params
 
     __all__ = [
@@ -52,4 +53,5 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "make_plan",
         "optimize",
         "scene_io",
+        "traverse",
     ]

@@ -31,6 +31,10 @@ class SetupError(PsdrError, RuntimeError):
     """The machine lacks something psdr_jit needs, such as a working LLVM."""
 
 
+class SetupWarning(UserWarning):
+    """The machine lacks something that is needed sooner or later; the message says how to get it."""
+
+
 class ZeroDerivativeWarning(UserWarning):
     """The derivative is 0 everywhere; the message says why."""
 
@@ -39,8 +43,16 @@ class UnsupportedWarning(UserWarning):
     """A part of the derivative is not modelled; the message names it."""
 
 
+class StorageError(PsdrError, OSError):
+    """The disk did not take a file: it is full, over quota, or broken."""
+
+
 class CheckpointError(PsdrError, RuntimeError):
     """The state of an optimisation cannot be written or read."""
+
+
+class LockedError(PsdrError, RuntimeError):
+    """Another run is at work in the folder."""
 
 
 class StalledWarning(UserWarning):

@@ -120,7 +120,10 @@ def require_count(name: str, value, hint: str = "") -> None:
 def require_runtime(seed, samples: int) -> None:
     """Raise `OptionError` unless a render call can use these; `samples` is the largest count of any term."""
     if samples >= 2**32:
-        raise OptionError(f"{samples} samples are more than 2^32: use fewer per pixel and average several seeds")
+        raise OptionError(
+            f"{samples:.3g} samples are more than 2^32, all that one render can take: use fewer per pixel and average "
+            "several seeds"
+        )
     if isinstance(seed, Integral) and not 0 <= seed < 2**32:
         raise OptionError(f"seed = {seed}: use a number from 0 to 2^32 - 1")
 

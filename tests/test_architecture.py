@@ -13,6 +13,7 @@ import psdr_jit
 
 ROOT = Path(psdr_jit.__file__).parent
 MAX_LINES = 300
+LAST_RESORT = "cli.main"  # turns whatever arrives into one line and an exit status
 
 ROOMS = (
     "errors", "options", "setup", "core", "scene", "paths", "plan", "edges", "sampling", "interior", "boundary",
@@ -114,7 +115,8 @@ def test_errors_are_typed_and_not_swallowed(module):
             assert node.type is not None, f"{module}:{node.lineno} catches everything"
             everything = getattr(node.type, "id", "") in ("Exception", "BaseException")
             raises_again = isinstance(node.body[-1], ast.Raise) and node.body[-1].exc is None
-            assert not everything or raises_again, f"{module}:{node.lineno} swallows whatever goes wrong"
+            allowed = raises_again or module == LAST_RESORT
+            assert not everything or allowed, f"{module}:{node.lineno} swallows whatever goes wrong"
 
 
 @pytest.mark.parametrize("module", modules())

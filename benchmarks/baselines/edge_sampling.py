@@ -40,23 +40,25 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from psdr_jit.boundary.light_lines import _open_side
 from psdr_jit.core import film as films
 from psdr_jit.core.ad import tangents
+from psdr_jit.core.compaction import compact
 from psdr_jit.core.low_discrepancy import pixel_sampler
 from psdr_jit.core.records import Hit
-from psdr_jit.core.sensor_frame import View
 from psdr_jit.core.streams import Stream, stream_seed
 from psdr_jit.driver.prepare import prepare
-from psdr_jit.edges.points import EdgePoint, clearance, segment_position
+from psdr_jit.edges.kind import Sight
+from psdr_jit.edges.kind_analytic import AnalyticCurves
 from psdr_jit.edges.rows import EdgeRows
-from psdr_jit.edges.table import EdgeTable, compact, distribution_of, edge_motion, scene_edges, sides
+from psdr_jit.edges.scene_table import scene_edges
+from psdr_jit.edges.table import EdgeTable, look_beside
 from psdr_jit.errors import UnsupportedError
-from psdr_jit.interior.term import _camera_passes
+from psdr_jit.interior.term import camera_passes
 from psdr_jit.paths.bounce import PathState, bounce
 from psdr_jit.paths.walk import SHADOW_EPSILON, NoSink, first_hit, walk
 from psdr_jit.plan.job import Job
 from psdr_jit.sampling.distribution import EdgeDistribution, pmf, sample_edge
+from psdr_jit.sampling.rows import WeightedRows
 from psdr_jit.scene.facts import SceneFacts
 
 #: Exterior angle that seams without one (split textures or normals) get, so that they are sampled at all [rad].
@@ -103,17 +105,19 @@ def require_supported(facts: SceneFacts) -> None:
 
 def scene_distribution(table: EdgeTable) -> EdgeDistribution | None:
     """All straight edges, weight length × exterior angle."""
-    if table.has_curves:
+    if any(isinstance(kind, AnalyticCurves) for kind in table.kinds):
         raise UnsupportedError(
             "edge sampling from camera paths has no outlines of spheres, cylinders and disks, which depend on the "
             "viewer; use psdr_path, or meshes in their place"
         )
-    if not table.has_segments:
-        return None
-    rows = table.segments.rows
+    return WeightedRows().init("edge sampling", [kind_weights(kind.rows) for kind in table.kinds])
+
+
+def kind_weights(rows: EdgeRows) -> mi.Float:
+    """Length × exterior angle."""
     jumps = rows.seam | rows.border | rows.traced
     angle = dr.maximum(rows.angle, dr.select(jumps, LEAST_ANGLE, 0))
-    return distribution_of([dr.norm(rows.p1 - rows.p0) * angle])
+    return dr.norm(rows.p1 - rows.p0) * angle
 
 
 @dataclass
@@ -134,14 +138,9 @@ class EdgeView:
     """An edge point that a path vertex sees. Detached, one entry per kept sample."""
 
     lane: mi.UInt32
-    row: mi.UInt32
-    t: mi.Float
-    x: mi.Point3f  # x_B
-    v: mi.Vector3f  # its velocity
+    sight: Sight  # of x_B from x_k
+    v: mi.Vector3f  # velocity of x_B
     u: mi.Vector3f  # that of x_k
-    ω: mi.Vector3f  # from x_k to x_B
-    r: mi.Float
-    side: mi.Vector3f  # s
     passes: mi.UInt32  # the side on which light passes a silhouette: 0 (−s) or 1 (+s); 2: no silhouette
     weight: mi.Spectrum  # β f cosθ |τ×ω| / (r² pdf)
     wavelengths: mi.Color0f
@@ -155,8 +154,8 @@ def secondary_boundary(job: Job) -> mi.TensorXf:
         dist = scene_distribution(table)
         if dist is None:
             return image
-        for p in _camera_passes(job):
-            dL = job.rejected.keep_finite(along_paths(job, table, dist, p))
+        for p in camera_passes(job):
+            dL = job.call.counters.rejected.keep_finite(along_paths(job, table, dist, p))
             dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
             image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
     return image
@@ -219,32 +218,27 @@ def sample_view(job: Job, table: EdgeTable, dist: EdgeDistribution, path: Camera
     """One edge point per vertex; kept if the vertex sees it, scatters light from there, and they move apart."""
     rng = pixel_sampler(seed, path.lane, spp)
     row, t = sample_edge(dist, mi.Float64(rng.next_1d()))
-    e = dr.gather(EdgeRows, table.segments.rows, row)
-    x, dx = segment_position(table.segments, row, t, mi.Bool(True))
-    with dr.resume_grad():
-        v = mi.Vector3f(tangents(edge_motion(table, row, t, mi.Point3f(0))))
-
-    offset = mi.Vector3f(x - si.p)
+    on = table.on(row, t, mi.Vector4f(si.p.x, si.p.y, si.p.z, 1))
+    offset = mi.Vector3f(on.x - si.p)
     r = dr.norm(offset)
     ω = offset / r
-    side = dr.cross(dx, ω)
-    speed_of_t = dr.norm(side)
-    side = dr.select(speed_of_t > 0, side / speed_of_t, 0)
-    n, _, silhouette = _open_side(e, dx, ω)
-    silhouette &= e.junction == 0  # where surfaces cut into each other, nothing passes
+    n_perp, across = on.across(ω)
+    sight = Sight.of(on, row, t, ω, r, n_perp)
+    with dr.resume_grad():
+        v = mi.Vector3f(tangents(table.displacement(sight.at)))
+    n, _, silhouette = table.ask(row, lambda kind, own_row, own: kind.open_side(own_row, on.dx, ω, own))
 
-    _, lead = clearance(x, dr.norm(dx), table.centre, e.blur)
-    active = (speed_of_t > 0) & (r > lead) & ((dr.dot(side, v - u) != 0) | sources_move(job.facts))
+    active = (across > 0) & (r > on.lead) & ((dr.dot(n_perp, v - u) != 0) | sources_move(job.facts))
     bsdf = si.bsdf()
     f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
-    weight = path.β * f * speed_of_t / (dr.square(r) * pmf(dist, row))
+    weight = path.β * f * across / (dr.square(r) * pmf(dist, row))
     active &= dr.any(weight != 0)
     # From the edge: where it rests on a surface, a ray to it would end beside it.
-    back = mi.Ray3f(x - lead * ω, -ω, 0, path.wavelengths)
-    back.maxt = (r - lead) * (1 - SHADOW_EPSILON)
+    back = mi.Ray3f(on.x - on.lead * ω, -ω, 0, path.wavelengths)
+    back.maxt = (r - on.lead) * (1 - SHADOW_EPSILON)
     active &= ~job.scene.ray_test(back, active)
-    passes = dr.select(silhouette, dr.select(dr.dot(n, side) > 0, mi.UInt32(1), 0), 2)
-    return compact(EdgeView(path.lane, row, t, x, v, u, ω, r, side, passes, weight, path.wavelengths), active)
+    passes = dr.select(silhouette, dr.select(dr.dot(n, n_perp) > 0, mi.UInt32(1), 0), 2)
+    return compact(EdgeView(path.lane, sight, v, u, passes, weight, path.wavelengths), active)
 
 
 def sources_move(facts: SceneFacts) -> bool:
@@ -254,13 +248,11 @@ def sources_move(facts: SceneFacts) -> bool:
 
 def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp: int) -> tuple[mi.Spectrum, mi.UInt32]:
     """Both sides of every edge point, at most `segments` from x_k on: `(contribution, camera path)`, 2 lanes each."""
-    index = dr.arange(mi.UInt32, 2 * dr.width(view.row))
+    index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
-    x_k = v.x - v.r * v.ω
-    seen = View(mi.Point2f(0), mi.Point2f(0), x_k, v.ω, v.r, mi.Float(0), mi.Bool(True))
-    point = EdgePoint(v.x, seen, v.side, mi.Float(1), mi.Bool(True))
-    ray, pi, differs = sides(job.scene, table, v.row, v.t, point, mi.Float(0), which, v.wavelengths)
-    speed = dr.dot(v.side, v.v - v.u)
+    x_k, n_perp = v.sight.viewer, v.sight.n_perp
+    ray, pi, differs = look_beside(job.scene, table, v.sight, which, v.wavelengths)
+    speed = dr.dot(n_perp, v.v - v.u)
     value = dr.zeros(mi.Spectrum, dr.width(index))
     if segments > 1:
         limits = replace(job.limits, max_depth=segments)
@@ -274,8 +266,8 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
         si = pi.compute_surface_interaction(ray, flags, shines)
         u_source = mi.Vector3f(tangents(si.p))
     si = dr.detach(si)
-    ratio = dr.select(si.is_valid(), v.r / dr.norm(si.p - x_k), 0)
-    relative = dr.select(si.is_valid(), ratio * dr.dot(v.side, u_source - v.u), 0)
+    ratio = dr.select(si.is_valid(), v.sight.r / dr.norm(si.p - x_k), 0)
+    relative = dr.select(si.is_valid(), ratio * dr.dot(n_perp, u_source - v.u), 0)
     value += dr.select(shines, si.emitter(job.scene).eval(si, shines) * (speed - relative), 0)
     return v.weight * value * dr.select(which == 0, 1.0, -1.0), v.lane
 

@@ -22,13 +22,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
-from ..core.sensor_frame import SensorFrame
 from ..core.streams import Stream, stream_seed
+from ..edges.kind import Use
 from ..edges.location import EdgeLocation
-from ..edges.rows import EdgeRows
-from ..edges.table import compact, edge_samples, shared_frame
 from ..options import Options
 from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
@@ -36,14 +35,15 @@ from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.directions import silhouette_wedges, wedge_measure
-from ..sampling.distribution import pmf, sample_edge, stratified
-from ..sampling.relevance import SecondaryEdges, can_cast_shadow, secondary_edges
+from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
+from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
 from . import segment_motion
-from .light_lines import source_from_curve, source_from_segment
-from .segment_motion import BoundarySamples
+from .light_lines import LightLine, sample_light_lines
+from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import UNLIMITED_VERTICES, Receivers, recorded_vertices, subpaths
+
+NAME = "direct"
 
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
 #: are drawn as make about one path per sample.
@@ -51,140 +51,97 @@ LINES_PER_PATH_UNDER_SKY = 2
 
 
 @dataclass
+class ShadowLine:
+    """A line through an edge point and an emitter point, before its ends are known. Detached, one per sample."""
+
+    lane: mi.UInt32
+    row: mi.UInt32
+    t: mi.Float
+    light: LightLine
+    pdf_row: mi.Float  # of row and t, times the number of samples
+    wavelengths: mi.Color0f
+    weight: mi.Spectrum  # of the wavelengths
+
+
+@dataclass
 class BoundarySegment:
     """x_D ← x_B → x_S on one line; detached, one entry per kept sample."""
 
-    row: mi.UInt32
-    t: mi.Float
     lane: mi.UInt32
-    local: mi.Point3f  # on a curve: x_B in object space
-    x: mi.Point3f  # x_B
+    at: EdgeLocation  # x_B
     ω: mi.Vector3f  # from x_D to x_S
-    n: mi.Vector3f  # n_⊥
+    n_perp: mi.Vector3f  # to the open side
     emitter: mi.UInt32  # registry index
     source: Hit  # x_S as the end of a ray from x_B; no shape unless it lies on an area light
     receiver: Hit  # x_D as the end of a ray from x_B
     r: mi.Float  # |x_B − x_D|
     ratio: mi.Float  # r_B / r_S
-    value: mi.Spectrum  # −L_e |τ×ω| / (pdf · number of samples)
+    value: mi.Spectrum  # −L_e |τ×ω|
+    pdf: mi.Float  # of the line, times the number of samples
     wavelengths: mi.Color0f
 
 
-def sample_segments(job: Job, frame: SensorFrame, edges: SecondaryEdges) -> BoundarySegment:
-    """Boundary segments that end on a receiver and on a visible emitter; all others are left out (value 0)."""
-    table, dist = edges.table, edges.distribution
-    scene = job.scene
-    count = edge_samples(job, frame, paths=1)
-    if scene.environment() is not None:
+def sample(job: Job, edges: SecondaryEdges) -> ShadowLine:
+    """Edge points, and emitter points on lines with them."""
+    count = edge_samples(job, paths=1)
+    if job.scene.environment() is not None:
         count *= LINES_PER_PATH_UNDER_SKY
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_EDGE), lane)
-    row, t = sample_edge(dist, stratified(count, rng.next_1d()))
-    it = dr.zeros(mi.Interaction3f, count)
-    it.wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    u = rng.next_2d()
-    straight = row < table.segment_count
-    found = None
-    if table.has_segments:
-        found = source_from_segment(scene, edges, row, t, mi.Interaction3f(it), u, straight)
-    if table.has_curves:
-        on_curve = source_from_curve(scene, edges, row, t, mi.Interaction3f(it), u, ~straight)
-        found = on_curve if found is None else dr.select(straight, found, on_curve)
-    e, ds = found
-    active = e.valid & (ds.pdf > 0) & dr.any(e.value != 0)
+    row, t, pdf_row = edges.sample_rows(count, rng.next_1d())
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
+    light = sample_light_lines(job.scene, edges, row, t, wavelengths, rng.next_2d())
+    return ShadowLine(lane, row, t, light, pdf_row, wavelengths, weight)
+
+
+def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment:
+    """The lines that end on a receiver and on a visible emitter; all others are left out (value 0)."""
+    scene, light, on = job.scene, line.light, line.light.on
+    active = light.valid & (light.pdf > 0) & dr.any(light.value != 0)
 
     # Towards the source: closest hit, so that the point on an area light can be attached.
-    on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
-    start = e.x + e.offset * e.n + e.lead * e.ω
-    up = mi.Ray3f(start, e.ω, 0, it.wavelengths)
-    up.maxt = dr.select(on_surface, dr.inf, e.dist - e.lead)
+    on_surface = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Surface)
+    start = on.x + on.offset * light.n_perp + on.lead * light.ω
+    up = mi.Ray3f(start, light.ω, 0, line.wavelengths)
+    up.maxt = dr.select(on_surface, dr.inf, light.dist - on.lead)
     pi = scene.ray_intersect_preliminary(up, coherent=False, active=active)
-    reached = pi.is_valid() & (pi.shape.emitter() == ds.emitter)
-    reached &= dr.abs(pi.t + e.lead - e.dist) < SHADOW_EPSILON * e.dist  # the sampled point, not another sheet of it
+    reached = pi.is_valid() & (pi.shape.emitter() == light.emitter)
+    reached &= dr.abs(pi.t + on.lead - light.dist) < SHADOW_EPSILON * light.dist  # not another sheet of the emitter
     active &= dr.select(on_surface, reached, ~pi.is_valid())
 
     # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.
-    down = mi.Ray3f(start, -e.ω, 0, it.wavelengths)
+    down = mi.Ray3f(start, -light.ω, 0, line.wavelengths)
     pd = scene.ray_intersect_preliminary(down, coherent=False, active=active)
-    r = pd.t - e.lead
-    active &= pd.is_valid() & (r > dr.select(straight, e.lead, e.offset))
+    r = pd.t - on.lead
+    # A contour's own surface may begin within its lead.
+    active &= pd.is_valid() & (r > dr.select(on.aside > 0, on.offset, on.lead))
 
-    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     segment = BoundarySegment(
-        row=row,
-        t=t,
-        lane=lane,
-        local=e.local,
-        x=e.x,
-        ω=e.ω,
-        n=e.n,
-        emitter=dr.reinterpret_array(mi.UInt32, ds.emitter),
+        lane=line.lane,
+        at=EdgeLocation(line.row, line.t, on.x, on.local, on.scale),
+        ω=light.ω,
+        n_perp=light.n_perp,
+        emitter=dr.reinterpret_array(mi.UInt32, light.emitter),
         source=Hit.of(up, pi),
         receiver=Hit.of(down, pd),
         r=r,
-        ratio=dr.select(infinite, 0, r / (r + e.dist)),
-        value=-e.value * weight * (e.across / (pmf(dist, row) * dr.opaque(mi.Float, count))),
-        wavelengths=it.wavelengths,
+        ratio=dr.select(infinite, 0, r / (r + light.dist)),
+        value=-light.value * line.weight * light.across,
+        pdf=light.pdf * line.pdf_row,
+        wavelengths=line.wavelengths,
     )
     return compact(segment, active)
 
 
-def longest_subpath(job: Job) -> int:
-    """Vertices from the sensor to the receiver, at most: one segment is left for the emitter."""
-    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
-
-
-def source_motion(job: Job, segment: BoundarySegment, moving: Displacements) -> mi.Float:
-    """Attached −(r_B/r_S) n_⊥·x_S, or −r_B n_⊥·ω for a directional light: what the emitter contributes."""
-    moved = -segment.ratio * dr.dot(segment.n, moving.of_surface(segment.source))
-    if job.facts.has_delta_emitters:
-        emitter = dr.reinterpret_array(mi.EmitterPtr, segment.emitter)
-        it = dr.zeros(mi.Interaction3f)
-        it.p = segment.x
-        it.wavelengths = segment.wavelengths
-        delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
-        point, turn = moving.of_light(emitter, it, delta)
-        at_infinity = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
-        by_turn, by_place = -segment.r * dr.dot(segment.n, turn), -segment.ratio * dr.dot(segment.n, point)
-        moved += dr.select(delta, dr.select(at_infinity, by_turn, by_place), 0)
-    return moved
-
-
-def _shadow_weight(job: Job, rows: EdgeRows) -> mi.Float:
-    """Weight per length: the lune in which the edge is a silhouette, if a light can see it as one.
-
-    Where two surfaces cut into each other both block the light: nothing passes such a curve.
-    """
-    casts = can_cast_shadow(job, rows) & (rows.junction == 0)
-    return dr.select(casts, wedge_measure(silhouette_wedges(rows)), 0)
-
-
-def _edges(job: Job) -> SecondaryEdges | None:
-    return secondary_edges(job, lambda rows: _shadow_weight(job, rows), lights_count=True)
-
-
-def edge_weights(job: Job) -> mi.Float | None:
-    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
-    edges = _edges(job)
-    return None if edges is None else edges.distribution.weight
-
-
-def _prepared(job: Job) -> BoundarySamples | None:
-    """Sampled, traced and recorded; None if there is nothing to sample."""
-    frame = shared_frame(job)
-    edges = _edges(job)
-    if edges is None:
-        return None
-    segment = sample_segments(job, frame, edges)
-    if dr.width(segment.row) == 0:
-        return None
-    a = -(1 - segment.ratio) * segment.n
-    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value, a)
-    records = subpaths(job, frame, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
+def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:
+    """What the segments are worth at the sensor: their subpaths are recorded."""
+    a = -(1 - segment.ratio) * segment.n_perp
+    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value / segment.pdf, a)
+    records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
     return BoundarySamples(
-        table=edges.table,
-        at=EdgeLocation(segment.row, segment.t, segment.x, segment.local, mi.Float(0)),
-        n=segment.n,
+        at=segment.at,
+        n_perp=segment.n_perp,
         wavelengths=segment.wavelengths,
         records=records,
         value=records.data.W,
@@ -192,14 +149,36 @@ def _prepared(job: Job) -> BoundarySamples | None:
     )
 
 
-def forward(job: Job) -> mi.TensorXf:
-    """Derivative image of the direct boundary along the tangents set on the scene's parameters. Detached."""
-    return segment_motion.forward(job, _prepared, longest_subpath(job))
+def source_motion(job: Job, segment: BoundarySegment, moving: Displacements) -> mi.Float:
+    """Attached −(r_B/r_S) n_⊥·x_S, or −r_B n_⊥·ω for a directional light: what the emitter contributes."""
+    moved = -segment.ratio * dr.dot(segment.n_perp, moving.of_surface(segment.source))
+    if job.facts.has_delta_emitters:
+        emitter = dr.reinterpret_array(mi.EmitterPtr, segment.emitter)
+        it = dr.zeros(mi.Interaction3f)
+        it.p = segment.at.x
+        it.wavelengths = segment.wavelengths
+        delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+        point, turn = moving.of_light(emitter, it, delta)
+        at_infinity = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        by_turn = -segment.r * dr.dot(segment.n_perp, turn)
+        by_place = -segment.ratio * dr.dot(segment.n_perp, point)
+        moved += dr.select(delta, dr.select(at_infinity, by_turn, by_place), 0)
+    return moved
 
 
-def backward(job: Job, grad_in: mi.TensorXf) -> None:
-    """Accumulate the direct boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    segment_motion.backward(job, _prepared, longest_subpath(job), grad_in)
+def longest_subpath(job: Job) -> int:
+    """Vertices from the sensor to the receiver, at most: one segment is left for the emitter."""
+    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
+
+
+ESTIMATOR = SecondaryTerm(
+    longest=longest_subpath,
+    edges=lambda job: secondary_edges(job, NAME, Use.SHADOW),
+    sample=sample,
+    trace=trace,
+    lanes=lambda segment: dr.width(segment.lane),
+    evaluate=evaluate,
+)
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
@@ -221,12 +200,14 @@ def cost(form: str, sky: bool) -> float:
 
 
 TERM = Term(
-    name="direct",
+    name=NAME,
     budget="sppd",
     streams=(Stream.DIRECT_EDGE, Stream.DIRECT_SUBPATH),
     needed=needed,
     cost=cost,
-    forward=forward,
-    backward=backward,
-    edges=EdgeSampling(edge_weights, "no light sees the others as an outline, or they are coplanar"),
+    forward=lambda job: segment_motion.forward(job, ESTIMATOR),
+    backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATOR, grad_in),
+    edges=EdgeSampling(
+        lambda job: line_weights(job, Use.SHADOW), "no light sees the others as an outline, or they are coplanar"
+    ),
 )

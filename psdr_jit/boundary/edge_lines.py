@@ -11,134 +11,101 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
-from ..core.sensor_frame import SensorFrame, View
 from ..core.streams import Stream, stream_seed
-from ..edges.curves import PIECES, CurveRows, attached_to_world, curve_point, local_viewpoint, transform_point
-from ..edges.points import CURVE_LEAD, EdgePoint, clearance, contour_side, segment_position
-from ..edges.rows import EdgeRows
-from ..edges.table import compact, edge_samples
+from ..edges.kind import FixedKind, OnEdge, Sight
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
 from ..plan.job import Job
-from ..sampling.directions import wedges
-from ..sampling.distribution import pmf, sample_edge, stratified
 from ..sampling.relevance import SecondaryEdges
+from ..sampling.rows import edge_samples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, recorded_vertices
+
+
+@dataclass
+class EdgeLine:
+    """A line through an edge point, before its ends are known. Detached, one entry per sample."""
+
+    lane: mi.UInt32
+    row: mi.UInt32
+    t: mi.Float
+    on: OnEdge
+    ω: mi.Vector3f  # from the viewer's side
+    n_perp: mi.Vector3f
+    across: mi.Float  # |dx/dt × ω| [m]
+    pdf_row: mi.Float  # of row and t, times the number of samples
+    pdf_sa: mi.Float
+    pdf_reversed: mi.Float  # per solid angle, of −ω
+    wavelengths: mi.Color0f
+    weight: mi.Spectrum  # of the wavelengths
+    valid: mi.Bool
 
 
 @dataclass
 class EdgeView:
     """A line through an edge point, with the receiver that sees it; detached, one entry per kept sample."""
 
-    row: mi.UInt32
-    t: mi.Float
     lane: mi.UInt32
-    local: mi.Point3f  # on a curve: x_B in object space
-    scale: mi.Float  # on a curve: size of the shape
-    x: mi.Point3f  # x_B
-    ω: mi.Vector3f  # from x_D to x_B
-    side: mi.Vector3f  # s
+    sight: Sight  # of x_B from x_D
     receiver: Hit  # x_D as the end of a ray from x_B
-    r: mi.Float  # |x_B − x_D|
-    weight: mi.Spectrum  # |τ×ω| / (pdf · number of samples)
+    value: mi.Spectrum  # |τ×ω|
+    pdf: mi.Float  # of the line, times the number of samples
     wavelengths: mi.Color0f
 
-    def point(self) -> EdgePoint:
-        """x_B as x_D sees it."""
-        seen = View(mi.Point2f(0), mi.Point2f(0), self.x - self.r * self.ω, self.ω, self.r, mi.Float(0), mi.Bool(True))
-        return EdgePoint(self.x, seen, self.side, mi.Float(1), mi.Bool(True))
 
-
-@dataclass
-class _Line:
-    """A line through an edge point. Detached."""
-
-    x: mi.Point3f
-    local: mi.Point3f
-    scale: mi.Float
-    ω: mi.Vector3f
-    side: mi.Vector3f
-    across: mi.Float  # |dx/dt × ω|
-    pdf_sa: mi.Float
-    pdf_reversed: mi.Float  # per solid angle, of −ω
-    lead: mi.Float
-    valid: mi.Bool
-
-
-def _line_on_segment(edges: SecondaryEdges, wedges_of, row, t, u, active) -> _Line:
-    e = dr.gather(EdgeRows, edges.table.segments.rows, row, active)
-    x, dx = segment_position(edges.table.segments, row, t, active)
-    w = wedges_of(e)
-    ω = edges.sample_view(e, w, row, x, u, active)
-    pdf, pdf_reversed = (edges.pdf_view(e, w, row, x, d, active) for d in (ω, -ω))
-    side = dr.cross(dx, ω)
-    across = dr.norm(side)
-    side = dr.select(across > 0, side / across, 0)
-    _, lead = clearance(x, dr.norm(dx), edges.table.centre, e.blur)
-    valid = active & (across > 0) & (pdf > 0)
-    return _Line(x, mi.Point3f(0), mi.Float(0), ω, side, across, pdf, pdf_reversed, lead, valid)
-
-
-def _line_on_curve(edges: SecondaryEdges, row, t, u, active) -> _Line:
-    """For a contour take the direction first: parallel lines of direction ω touch a surface along one contour."""
-    table = edges.table
-    rows = dr.gather(CurveRows, table.curves.rows, row - table.segment_count, active)
-    columns = tuple(dr.detach(c) for c in attached_to_world(table.curves.shapes, rows.shape))
-    ω = mi.warp.square_to_uniform_sphere(u)
-    local = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0)))
-    x = mi.Point3f(transform_point(columns, local.x))
-    side, across, scale = contour_side(columns, local, ω)
-    valid = active & local.valid & (across > 0)
-    pdf = mi.Float(dr.inv_four_pi)
-    return _Line(x, local.x, scale, ω, side, across, pdf, pdf, CURVE_LEAD * scale, valid)
-
-
-def sample_views(job: Job, frame: SensorFrame, edges: SecondaryEdges, wedges_of=wedges) -> EdgeView:
-    """Lines through edge points that end on a receiver; `wedges_of(rows)`: directions that count at straight edges."""
-    table, dist = edges.table, edges.distribution
-    count = edge_samples(job, frame, paths=2)
+def sample_lines(job: Job, edges: SecondaryEdges) -> EdgeLine:
+    """Lines through edge points, in directions in which the edges can matter."""
+    count = edge_samples(job, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_EDGE), lane)
-    row, t = sample_edge(dist, stratified(count, rng.next_1d()))
+    row, t, pdf_row = edges.sample_rows(count, rng.next_1d())
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     u = rng.next_2d()
-    straight = row < table.segment_count
-    line = None
-    if table.has_segments:
-        line = _line_on_segment(edges, wedges_of, row, t, u, straight)
-    if table.has_curves:
-        on_curve = _line_on_curve(edges, row, t, u, ~straight)
-        line = on_curve if line is None else dr.select(straight, line, on_curve)
 
-    # A tangent line starts beside a curved surface, not on it.
-    beside = dr.select(straight, 0, clearance(line.x, line.scale, table.centre)[0]) * line.side
-    ω, side, pdf = line.ω, line.side, line.pdf_sa
-    down = mi.Ray3f(line.x + beside - line.lead * ω, -ω, 0, wavelengths)
+    def draw(kind, own_row: mi.UInt32, active: mi.Bool):
+        if isinstance(kind, FixedKind):
+            on = kind.on(own_row, t, mi.Vector4f(0, 0, 0, 1), active)
+            w = kind.wedges(own_row, edges.use, active)
+            ω = edges.sample_view(w, row, on.x, u, active)
+            return on, ω, *(edges.pdf_view(w, row, on.x, d, active) for d in (ω, -ω))
+        # For a contour take the direction first: parallel lines of direction ω touch a surface along one contour.
+        ω = mi.warp.square_to_uniform_sphere(u)
+        on = kind.on(own_row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), active)
+        return on, ω, mi.Float(dr.inv_four_pi), mi.Float(dr.inv_four_pi)
+
+    on, ω, pdf_sa, pdf_reversed = edges.table.ask(row, draw)
+    n_perp, across = on.across(ω)
+    valid = on.valid & (across > 0) & (pdf_sa > 0)
+    return EdgeLine(
+        lane, row, t, on, ω, n_perp, across, pdf_row, pdf_sa, pdf_reversed, wavelengths, weight, valid
+    )
+
+
+def trace_receivers(job: Job, line: EdgeLine) -> EdgeView:
+    """The lines that end on a receiver."""
+    on, ω, n_perp, pdf_sa = line.on, line.ω, line.n_perp, line.pdf_sa
+    start = on.x + on.aside * n_perp
+    down = mi.Ray3f(start - on.lead * ω, -ω, 0, line.wavelengths)
     pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
     if job.scene.environment() is not None and job.form == "spatial":
         # Lines of which one end escapes have their receiver at the other, whichever direction was drawn.
-        up = mi.Ray3f(line.x + beside + line.lead * ω, ω, 0, wavelengths)
+        up = mi.Ray3f(start + on.lead * ω, ω, 0, line.wavelengths)
         other = job.scene.ray_intersect_preliminary(up, coherent=False, active=line.valid)
         open_end = ~(pi.is_valid() & other.is_valid())
         turn = ~pi.is_valid()
-        ω, side = dr.select(turn, -ω, ω), dr.select(turn & straight, -side, side)
+        ω = dr.select(turn, -ω, ω)
+        n_perp = dr.select(turn & (on.aside == 0), -n_perp, n_perp)  # a contour's leads off its surface either way
         down, pi = dr.select(turn, up, down), dr.select(turn, other, pi)
-        pdf = dr.select(open_end, pdf + line.pdf_reversed, pdf)
+        pdf_sa = dr.select(open_end, pdf_sa + line.pdf_reversed, pdf_sa)
     view = EdgeView(
-        row=row,
-        t=t,
-        lane=lane,
-        local=line.local,
-        scale=line.scale,
-        x=line.x,
-        ω=ω,
-        side=side,
+        lane=line.lane,
+        sight=Sight.of(on, line.row, line.t, ω, pi.t + on.lead, n_perp),
         receiver=Hit.of(down, pi),
-        r=pi.t + line.lead,
-        weight=weight * (line.across / (pmf(dist, row) * pdf * dr.opaque(mi.Float, count))),
-        wavelengths=wavelengths,
+        value=line.weight * line.across,
+        pdf=line.pdf_row * pdf_sa,
+        wavelengths=line.wavelengths,
     )
     return compact(view, line.valid & pi.is_valid())
 

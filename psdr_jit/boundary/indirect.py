@@ -19,20 +19,37 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.streams import Stream
-from ..edges.location import EdgeLocation
-from ..edges.table import EdgeTable, shared_frame, sides
+from ..edges.kind import Use
+from ..edges.table import EdgeTable, look_beside
 from ..options import Options
 from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.directions import wedge_measure, wedges
-from ..sampling.relevance import SecondaryEdges, secondary_edges
+from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
 from . import indirect_material, segment_motion
-from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
-from .segment_motion import BoundarySamples
+from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
+from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
+
+NAME = "indirect"
+
+
+def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples:
+    """The step of radiance across every edge, at the sensor."""
+    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.value / view.pdf, -view.sight.n_perp)
+    records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
+    value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, edges.table, view, records))
+    dr.eval(value)
+    return BoundarySamples(
+        at=view.sight.at,
+        n_perp=view.sight.n_perp,
+        wavelengths=view.wavelengths,
+        records=records,
+        value=value,
+        source_motion=lambda moving: mi.Float(0),
+    )
 
 
 def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -> mi.Spectrum:
@@ -56,61 +73,34 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
 
 def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     """Radiance from both sides of every edge point, by depth: `(by_depth, final)`, 2 lanes each (−, +)."""
-    index = dr.arange(mi.UInt32, 2 * dr.width(view.row))
+    index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
-    ray, pi, differs = sides(job.scene, table, v.row, v.t, v.point(), v.scale, which, v.wavelengths)
+    ray, pi, differs = look_beside(job.scene, table, v.sight, which, v.wavelengths)
     return radiance_by_depth(job, ray, pi, v.lane, vertices, differs)
 
 
-def _spatial_edges(job: Job) -> SecondaryEdges | None:
-    return secondary_edges(job, lambda rows: wedge_measure(wedges(rows)), lights_count=False)
+#: How the term is estimated, by form.
+ESTIMATORS = {
+    "spatial": SecondaryTerm(
+        longest=longest_subpath,
+        edges=lambda job: secondary_edges(job, NAME, Use.STEP),
+        sample=sample_lines,
+        trace=lambda job, edges, line: trace_receivers(job, line),
+        lanes=lambda view: dr.width(view.lane),
+        evaluate=evaluate,
+    ),
+    "material": SecondaryTerm(
+        longest=longest_subpath,
+        edges=lambda job: secondary_edges(job, NAME, Use.BACKGROUND),
+        sample=sample_lines,
+        trace=indirect_material.trace,
+        lanes=lambda background: dr.width(background.sign),
+        evaluate=indirect_material.evaluate,
+    ),
+}
 
-
-def _prepared(job: Job) -> BoundarySamples | None:
-    """Sampled, traced and recorded, in spatial form; None if there is nothing to sample."""
-    frame = shared_frame(job)
-    edges = _spatial_edges(job)
-    if edges is None:
-        return None
-    table = edges.table
-    view = sample_views(job, frame, edges)
-    if dr.width(view.row) == 0:
-        return None
-
-    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.weight, -view.side)
-    records = subpaths(job, frame, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
-    value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, table, view, records))
-    dr.eval(value)
-    return BoundarySamples(
-        table=table,
-        at=EdgeLocation(view.row, view.t, view.x, view.local, view.scale),
-        n=view.side,
-        wavelengths=view.wavelengths,
-        records=records,
-        value=value,
-        source_motion=lambda moving: mi.Float(0),
-    )
-
-
-#: Which edges are sampled, and how the term is estimated, by form.
-EDGES = {"spatial": _spatial_edges, "material": indirect_material.background_edges}
-PREPARE = {"spatial": _prepared, "material": indirect_material.prepared}
-
-
-def edge_weights(job: Job) -> mi.Float | None:
-    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
-    edges = EDGES[job.form](job)
-    return None if edges is None else edges.distribution.weight
-
-
-def forward(job: Job) -> mi.TensorXf:
-    """Derivative image of the indirect boundary along the tangents set on the scene's parameters. Detached."""
-    return segment_motion.forward(job, PREPARE[job.form], longest_subpath(job))
-
-
-def backward(job: Job, grad_in: mi.TensorXf) -> None:
-    """Accumulate the indirect boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    segment_motion.backward(job, PREPARE[job.form], longest_subpath(job), grad_in)
+#: What lines are drawn for, by form.
+USES = {"spatial": Use.STEP, "material": Use.BACKGROUND}
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
@@ -132,12 +122,15 @@ def cost(form: str, sky: bool) -> float:
 
 
 TERM = Term(
-    name="indirect",
+    name=NAME,
     budget="sppi",
     streams=(Stream.INDIRECT_EDGE, Stream.INDIRECT_SUBPATH, Stream.INDIRECT_RADIANCE),
     needed=needed,
     cost=cost,
-    forward=forward,
-    backward=backward,
-    edges=EdgeSampling(edge_weights, "the others are coplanar, or lie inside of closed surfaces"),
+    forward=lambda job: segment_motion.forward(job, ESTIMATORS[job.form]),
+    backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATORS[job.form], grad_in),
+    edges=EdgeSampling(
+        lambda job: line_weights(job, USES[job.form]),
+        "the others are coplanar, or lie inside of closed surfaces",
+    ),
 )

@@ -18,19 +18,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.compaction import compact
 from ..core.records import Hit
 from ..core.streams import Stream
-from ..edges.location import EdgeLocation
-from ..edges.table import EdgeTable, background, compact, shared_frame
+from ..edges.table import look_behind
 from ..plan.job import Job
-from ..sampling.directions import background_wedges, wedge_measure
-from ..sampling.relevance import SecondaryEdges, secondary_edges
-from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_views, slots
+from ..sampling.relevance import SecondaryEdges
+from .edge_lines import EdgeLine, EdgeView, longest_subpath, radiance_by_depth, slots, trace_receivers
 from .segment_motion import BoundarySamples
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
-
-#: Share of a resting edge's directions in which movers are behind it; otherwise they are in front.
-AHEAD = 0.5
 
 
 @dataclass
@@ -43,18 +39,33 @@ class Background:
     sign: mi.Float  # +1 on side −s, −1 on side +s
 
 
-def background_edges(job: Job) -> SecondaryEdges | None:
-    """The edges behind which something can appear."""
-    return secondary_edges(job, lambda rows: wedge_measure(background_wedges(rows)), lights_count=False, ahead=AHEAD)
-
-
-def _backgrounds(job: Job, table: EdgeTable, view: EdgeView) -> Background:
-    """Both sides of every edge point, as far as a surface lies there that does not move with the edge."""
-    index = dr.arange(mi.UInt32, 2 * dr.width(view.row))
+def trace(job: Job, edges: SecondaryEdges, line: EdgeLine) -> Background:
+    """Both sides of every edge point with a receiver, as far as a surface lies there that moves against the edge."""
+    view = trace_receivers(job, line)
+    index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
-    ray, pi, beyond = background(job.scene, table, v.row, v.t, v.point(), v.scale, which, v.wavelengths)
-    found = Background(v, Hit.of(ray, pi), v.r / (v.r + beyond), dr.select(which == 0, 1.0, -1.0))
+    ray, pi, beyond = look_behind(job.scene, edges.table, v.sight, which, v.wavelengths)
+    r = v.sight.r
+    found = Background(v, Hit.of(ray, pi), r / (r + beyond), dr.select(which == 0, 1.0, -1.0))
     return compact(found, pi.is_valid())
+
+
+def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
+    """What the background is worth at the sensor."""
+    v = b.view
+    a = -(1 - b.ratio) * v.sight.n_perp
+    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a)
+    records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
+    value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
+    dr.eval(value)
+    return BoundarySamples(
+        at=v.sight.at,
+        n_perp=v.sight.n_perp,
+        wavelengths=v.wavelengths,
+        records=records,
+        value=value,
+        source_motion=lambda moving: -b.ratio * dr.dot(v.sight.n_perp, moving.of_surface(b.source)),
+    )
 
 
 def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
@@ -74,31 +85,3 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
     slot = dr.gather(mi.UInt32, slot, lane)
     L = by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed))
     return dr.select(needed, L, 0)
-
-
-def prepared(job: Job) -> BoundarySamples | None:
-    """Sampled, traced and recorded; None if there is nothing to sample."""
-    frame = shared_frame(job)
-    edges = background_edges(job)
-    if edges is None:
-        return None
-    view = sample_views(job, frame, edges, background_wedges)
-    if dr.width(view.row) == 0:
-        return None
-    b = _backgrounds(job, edges.table, view)
-    if dr.width(b.sign) == 0:
-        return None
-    v = b.view
-    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.weight * b.sign, -(1 - b.ratio) * v.side)
-    records = subpaths(job, frame, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
-    value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
-    dr.eval(value)
-    return BoundarySamples(
-        table=edges.table,
-        at=EdgeLocation(v.row, v.t, v.x, v.local, v.scale),
-        n=v.side,
-        wavelengths=v.wavelengths,
-        records=records,
-        value=value,
-        source_motion=lambda moving: -b.ratio * dr.dot(b.view.side, moving.of_surface(b.source)),
-    )

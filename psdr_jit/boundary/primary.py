@@ -18,42 +18,42 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import backpropagate, tangents
+from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
-from ..core.sensor_frame import SensorFrame
+from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
-from ..edges.location import EdgeLocation
-from ..edges.points import VISIBILITY_EPSILON, EdgePoint, curve_row_point, segment_point
-from ..edges.table import (
-    EdgeTable,
-    compact,
-    edge_samples,
-    scene_edges,
-    shared_frame,
-    sides,
-)
+from ..core.varying import varying
+from ..edges.kind import Sight
+from ..edges.points import VISIBILITY_EPSILON
+from ..edges.scene_table import scene_edges
+from ..edges.table import EdgeTable, look_beside
 from ..options import Options
 from ..paths.walk import NoSink, skip_emitters, walk
 from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling import film_weights
-from ..sampling.distribution import EdgeDistribution, distribution_of, pmf, sample_edge, stratified
+from ..sampling.distribution import stratified
+from ..sampling.rows import ROW_SAMPLER, RowSampler, edge_samples
 from ..scene.facts import SceneFacts
+
+NAME = "primary"
 
 
 @dataclass(frozen=True)
 class PrimaryEdges:
-    """What can be seen to move, and the density with which it is sampled."""
+    """What can be seen to move, and how its rows are drawn."""
 
     table: EdgeTable
-    distribution: EdgeDistribution
+    rows: RowSampler
+    state: Any  # of `rows`
 
 
 @dataclass
@@ -63,70 +63,62 @@ class EdgeSample:
     row: mi.UInt32
     t: mi.Float
     aperture: mi.Point2f
-    inv_pdf: mi.Float  # 1 / (pmf of the row · number of samples)
+    pdf: mi.Float  # of row and t, times the number of samples
     lane: mi.UInt32
 
 
-def primary_edges(job: Job, frame: SensorFrame) -> PrimaryEdges | None:
-    """Edges that can move on the film: of moving shapes, or of all if the camera moves. None: nothing can."""
+@dataclass
+class SeenEdge:
+    """An edge point on the film; detached, one entry per sample."""
+
+    sight: Sight
+    view: View
+    across: mi.Float  # length of edge seen per unit of its parameter, |dx/dt × ω| [m]
+    valid: mi.Bool
+
+
+def film_weights(job: Job) -> list[mi.Float]:
+    """By kind of edge, the weight of each row: of moving shapes, or of all if the camera moves."""
     table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
-    weights = []
-    if table.has_segments:
-        weights.append(film_weights.segment_weights(table.segments, frame, border))
-    if table.has_curves:
-        weights.append(film_weights.curve_weights(table.curves, frame, border))
-    if not job.facts.camera_moves and job.plan.prunes:
-        weights = [dr.select(rests, 0, w) for w, rests in zip(weights, table.rests, strict=True)]
-    distribution = distribution_of(weights)
-    return None if distribution is None else PrimaryEdges(table, distribution)
+    weights = table.weights(lambda kind: kind.film_weights(job.frame, border))
+    if job.facts.camera_moves or not job.plan.prunes:
+        return weights
+    return [dr.select(moves, w, 0) for w, moves in zip(weights, table.moving(), strict=True)]
 
 
-def edge_weights(job: Job) -> mi.Float | None:
-    """Density of edge samples by row of the edge table, not normalised; None if there is none."""
-    edges = primary_edges(job, shared_frame(job))
-    return None if edges is None else edges.distribution.weight
+def primary_edges(job: Job) -> PrimaryEdges | None:
+    """Edges that can move on the film. None: nothing can."""
+    rows = job.call.memory[ROW_SAMPLER]
+    state = rows.init(NAME, film_weights(job))
+    return None if state is None else PrimaryEdges(scene_edges(job), rows, state)
 
 
-@dataclass
-class _Seen:
-    """An edge point of either table, with what only one of them needs."""
-
-    point: EdgePoint
-    straight: mi.Bool
-    local: mi.Point3f  # curves: material point
-    scale: mi.Float  # curves: size of the shape
-
-
-def _edge_point(edges: PrimaryEdges, sample: EdgeSample, frame: SensorFrame) -> _Seen:
-    straight = sample.row < edges.table.segment_count
-    local, scale, point = mi.Point3f(0), mi.Float(0), None
-    if edges.table.has_segments:
-        point = segment_point(edges.table.segments, sample.row, sample.t, frame, sample.aperture, straight)
-    if edges.table.has_curves:
-        row = sample.row - edges.table.segment_count
-        on_curve, local, scale = curve_row_point(edges.table.curves, row, sample.t, frame, sample.aperture, ~straight)
-        point = on_curve if point is None else dr.select(straight, point, on_curve)
-    return _Seen(point, straight, local, scale)
+def seen_edge(job: Job, edges: PrimaryEdges, sample: EdgeSample) -> SeenEdge:
+    """The edge points as the sensor sees them."""
+    on = edges.table.on(sample.row, sample.t, viewpoint(job.frame, sample.aperture))
+    view = look_at(job.frame, on.x, sample.aperture)
+    n_perp, across = on.across(view.ω)
+    sight = Sight.of(on, sample.row, sample.t, view.ω, view.r, n_perp)
+    return SeenEdge(sight, view, across, on.valid & view.valid & (across > 0))
 
 
-def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSample:
+def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample:
     """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
-    lower, upper = frame.window
-    count = edge_samples(job, frame, paths=2)
+    lower, upper = job.frame.window
+    count = edge_samples(job, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
-    row, t = sample_edge(edges.distribution, stratified(count, rng.next_1d()))
-    aperture = rng.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
-    sample = EdgeSample(row, t, aperture, dr.rcp(pmf(edges.distribution, row) * dr.opaque(mi.Float, count)), lane)
+    row, t = edges.rows.sample(edges.state, stratified(count, rng.next_1d()))
+    aperture = rng.next_2d() if job.frame.kind == "thinlens" else mi.Point2f(0.5)
+    pdf = edges.rows.pdf(edges.state, row, t) * varying(mi.Float, count)
+    sample = EdgeSample(row, t, aperture, pdf, lane)
 
-    seen = _edge_point(edges, sample, frame)
-    view, p = seen.point.view, seen.point.view.p
+    seen = seen_edge(job, edges, sample)
+    view, p = seen.view, seen.view.p
     inside = (p.x >= lower[0]) & (p.x < upper[0]) & (p.y >= lower[1]) & (p.y < upper[1])
-    active = seen.point.valid & inside
-    # A ray aimed at a tangent point meets the shape itself: aim beside it.
-    aim = seen.point.x + dr.select(seen.straight, 0, VISIBILITY_EPSILON * seen.scale) * seen.point.side
-    direction = aim - view.o
+    active = seen.valid & inside
+    direction = edges.table.aim(seen.sight) - view.o
     distance = dr.norm(direction)
     ray = mi.Ray3f(view.o, direction / distance)
     ray.maxt = distance * (1 - VISIBILITY_EPSILON)
@@ -138,15 +130,15 @@ def sample_visible(job: Job, frame: SensorFrame, edges: PrimaryEdges) -> EdgeSam
     return compact(sample, active & ~blocked)
 
 
-def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeSample):
-    """Radiance and coverage on the − and + side of every sample: `(L, alpha, wavelengths, differs)`, 2 lanes each."""
+def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
+    """Radiance and coverage on the − and + side of every sample: `(L, alpha, wavelengths)`, 2 lanes each."""
     n = dr.width(sample.row)
     index = dr.arange(mi.UInt32, 2 * n)
     which, s = index & 1, dr.gather(EdgeSample, sample, index >> 1)
-    seen = _edge_point(edges, s, frame)
+    seen = seen_edge(job, edges, s)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    ray, pi, differs = sides(job.scene, edges.table, s.row, s.t, seen.point, seen.scale, which, wavelengths)
+    ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
         ray, pi = skip_emitters(job.scene, ray, pi)
@@ -162,32 +154,30 @@ def _both_sides(job: Job, frame: SensorFrame, edges: PrimaryEdges, sample: EdgeS
 
 def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None]) -> mi.TensorXf | None:
     """`finish(image)`, the boundary as an image of value 0 that carries its derivative; None if there is nothing."""
-    frame = shared_frame(job)
     with dr.suspend_grad():
-        edges = primary_edges(job, frame)
+        edges = primary_edges(job)
         if edges is None:
             return None
-        sample = sample_visible(job, frame, edges)
+        sample = sample_visible(job, edges)
         if dr.width(sample.row) == 0:
             return None
-        L, alpha, wavelengths = _both_sides(job, frame, edges, sample)
+        L, alpha, wavelengths = trace_sides(job, edges, sample)
         even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
         step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
         ΔL = job.call.counters.rejected.keep_finite(step)
+        edges.rows.learn(edges.state, sample.row, sample.t, ΔL)
         Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
         wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
-        seen = _edge_point(edges, sample, frame)
-        point = seen.point
-        scale = point.speed / point.view.J_px * sample.inv_pdf
+        seen = seen_edge(job, edges, sample)
+        sight, view = seen.sight, seen.view
+        scale = seen.across / (view.J_px * sample.pdf)
 
     with job.motion.attached() as moving:
-        at = EdgeLocation(sample.row, sample.t, point.x, seen.local, seen.scale)
-        relative = moving.of_edge(edges.table, at)
+        relative = moving.of_edge(edges.table, sight.at)
         if job.facts.camera_moves:
-            relative -= moving.of_camera(point.view.film, sample.aperture, point.x)
-        motion = dr.dot(point.side, relative) * scale
-        p = point.view.p
-        return finish(films.develop_boundary(job.film, p, ΔL * motion, Δα * motion, wavelengths, point.valid))
+            relative -= moving.of_camera(view.film, sample.aperture, sight.at.x)
+        motion = dr.dot(sight.n_perp, relative) * scale
+        return finish(films.develop_boundary(job.film, view.p, ΔL * motion, Δα * motion, wavelengths, seen.valid))
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -216,12 +206,12 @@ def cost(form: str, sky: bool) -> float:
 
 
 TERM = Term(
-    name="primary",
+    name=NAME,
     budget="sppp",
     streams=(Stream.PRIMARY_EDGE, Stream.PRIMARY_RADIANCE),
     needed=needed,
     cost=cost,
     forward=forward,
     backward=backward,
-    edges=EdgeSampling(edge_weights, "the others rest, are coplanar, turn away or leave the film"),
+    edges=EdgeSampling(film_weights, "the others rest, are coplanar, turn away or leave the film"),
 )

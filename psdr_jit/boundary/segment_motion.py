@@ -1,6 +1,8 @@
-"""Derivatives of boundary segments found in the middle of a path, written once for the direct and indirect terms.
+"""The secondary boundary terms, from top to bottom: sample, trace, evaluate, splat; and their derivatives.
 
-Each connection of a recorded sensor subpath has a value W (detached) and a motion (attached, primal value 0):
+A term says how its lines are sampled, how their ends are found and what they are worth (`SecondaryTerm`); everything
+else is written once, here. Each connection of a recorded sensor subpath has a value W (detached) and a motion
+(attached, primal value 0):
 
     M_k = n_⊥·v_B + source + Σ_{j<k} g_j^continue·v_j + g_k^connect·v_k + (what is left)·camera ray
 
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,26 +22,37 @@ import mitsuba as mi
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
 from ..edges.location import EdgeLocation
-from ..edges.table import EdgeTable
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
+from ..sampling.relevance import SecondaryEdges
 from .sensor_subpath import SubpathRecords
+
+L = TypeVar("L")
+S = TypeVar("S")
 
 
 @dataclass(frozen=True)
 class BoundarySamples:
     """Boundary segments with their sensor subpaths. Lanes: segments; flat: vertex-major connections."""
 
-    table: EdgeTable
     at: EdgeLocation  # x_B
-    n: mi.Vector3f  # n_⊥
+    n_perp: mi.Vector3f
     wavelengths: mi.Color0f
     records: SubpathRecords
     value: mi.Spectrum  # flat: splatted per unit of motion
     source_motion: Callable[[Displacements], mi.Float]  # attached, per lane, primal value 0
 
 
-Prepare = Callable[[Job], "BoundarySamples | None"]
+@dataclass(frozen=True)
+class SecondaryTerm(Generic[L, S]):
+    """How one secondary boundary is estimated. Every step is detached."""
+
+    longest: Callable[[Job], int]  # vertices of the longest sensor subpath; < 1: there is nothing to estimate
+    edges: Callable[[Job], SecondaryEdges | None]  # what is sampled; None: nothing can contribute
+    sample: Callable[[Job, SecondaryEdges], L]  # lines through edge points
+    trace: Callable[[Job, SecondaryEdges, L], S]  # those that end where they should; the ends
+    lanes: Callable[[S], int]  # how many
+    evaluate: Callable[[Job, SecondaryEdges, S], BoundarySamples]  # what they are worth
 
 
 @dataclass
@@ -51,8 +65,8 @@ class _Motion:
     camera: mi.Float
 
 
-def _motion(job: Job, s: BoundarySamples, moving: Displacements) -> _Motion:
-    at_edge = dr.dot(s.n, moving.of_edge(s.table, s.at)) + s.source_motion(moving)
+def _motion(job: Job, edges: SecondaryEdges, s: BoundarySamples, moving: Displacements) -> _Motion:
+    at_edge = dr.dot(s.n_perp, moving.of_edge(edges.table, s.at)) + s.source_motion(moving)
     c = s.records.data
     surface = moving.of_surface(c.hit)
     camera = mi.Float(0)
@@ -70,44 +84,59 @@ def _splat(job: Job, s: BoundarySamples, motion: mi.Float) -> mi.TensorXf:
     return films.develop_boundary(job.film, c.p, s.value * motion, mi.Float(0), wavelengths, landed)
 
 
-def forward(job: Job, prepare: Prepare, longest: int) -> mi.TensorXf:
-    """Derivative image along the tangents set on the scene's parameters, in passes that fit into memory. Detached.
-
-    `prepare` samples, traces and records one pass; `longest`: vertices of the longest sensor subpath.
-    """
+def forward(job: Job, term: SecondaryTerm) -> mi.TensorXf:
+    """Derivative image along the tangents set on the scene's parameters, in passes that fit into memory. Detached."""
+    longest = term.longest(job)
     if longest < 1:
         return films.black(job.film)
     with dr.suspend_grad():
         parts = passes(job, longest * SubpathRecords.BYTES_RGB)
-        images = [share * _derivative_image(part, prepare(part)) for share, part in parts]
+        images = [share * _derivative_image(part, term) for share, part in parts]
     return sum(images[1:], images[0])
 
 
-def backward(job: Job, prepare: Prepare, longest: int, grad_in: mi.TensorXf) -> None:
+def backward(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`, same samples."""
+    longest = term.longest(job)
     if longest < 1:
         return
     with dr.suspend_grad():
         for share, part in passes(job, longest * SubpathRecords.BYTES_RGB):
-            _accumulate_adjoint(part, prepare(part), share * grad_in)
+            _accumulate_adjoint(part, term, share * grad_in)
 
 
-def _derivative_image(job: Job, s: BoundarySamples | None) -> mi.TensorXf:
+def _samples(job: Job, term: SecondaryTerm) -> tuple[SecondaryEdges, BoundarySamples] | None:
+    """Sampled, traced and evaluated; None if nothing is left."""
+    edges = term.edges(job)
+    if edges is None:
+        return None
+    segments = term.trace(job, edges, term.sample(job, edges))
+    if term.lanes(segments) == 0:
+        return None
+    s = term.evaluate(job, edges, segments)
+    edges.rows.learn(edges.state, s.at.row, s.at.t, s.value)
+    return edges, s
+
+
+def _derivative_image(job: Job, term: SecondaryTerm) -> mi.TensorXf:
     """One pass of `forward`."""
-    if s is None:
+    found = _samples(job, term)
+    if found is None:
         return films.black(job.film)
+    edges, s = found
     with job.motion.attached() as moving:
-        m = _motion(job, s, moving)
-        grads = tangents(m.segment, m.connect, m.go_on, m.camera)
-    at_edge, connect, go_on, camera = grads
+        m = _motion(job, edges, s, moving)
+        at_edge, connect, go_on, camera = tangents(m.segment, m.connect, m.go_on, m.camera)
     motion = dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
     return _splat(job, s, job.call.counters.rejected.keep_finite(mi.Color1f(motion)).x)
 
 
-def _accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorXf) -> None:
+def _accumulate_adjoint(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:
     """One pass of `backward`."""
-    if s is None:
+    found = _samples(job, term)
+    if found is None:
         return
+    edges, s = found
     with dr.resume_grad():
         motion = dr.zeros(mi.Float, s.records.lanes * s.records.depth)
         dr.enable_grad(motion)
@@ -117,5 +146,5 @@ def _accumulate_adjoint(job: Job, s: BoundarySamples | None, grad_in: mi.TensorX
     after = s.records.after(δ)
     total = s.records.total(δ, after)
     with job.motion.attached() as moving:
-        m = _motion(job, s, moving)
+        m = _motion(job, edges, s, moving)
         accumulate(dr.sum(total * m.segment) + dr.sum(δ * (m.connect + m.camera) + after * m.go_on))

@@ -29,6 +29,7 @@ from ..core.records import Hit
 from ..core.sensor_frame import SensorFrame, View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
+from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
 from ..paths.scattering import UNIFORM_SHARE
 from ..plan.job import Job
@@ -156,11 +157,11 @@ def _connected(records: SubpathRecords) -> mi.Bool:
     return found
 
 
-def subpaths(job: Job, frame: SensorFrame, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
+def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
     """Walk every receiver x_D back to the sensor, at most `longest` vertices."""
     records = SubpathRecords(dr.width(receivers.lane), longest)
     limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE)
-    walk_to_sensor(job, frame, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
+    walk_to_sensor(job, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
     dr.eval(records.data)
     return records
 
@@ -172,7 +173,7 @@ def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
 
 
 @dataclass
-class _Sight:
+class _AtSensor:
     """How the sensor sees a vertex, and what a path that ends there would be worth. Detached."""
 
     view: View
@@ -180,30 +181,30 @@ class _Sight:
     W: mi.Spectrum  # 0 where it is not seen
 
 
-def _sight(scene: mi.Scene, frame: SensorFrame, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active) -> _Sight:
+def _connect(
+    scene: mi.Scene, frame: SensorFrame, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active: mi.Bool
+) -> _AtSensor:
     """Connect the vertex to the sensor; `value`: of the boundary segment and the path that led here."""
     aperture = sampler.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
     view = look_at(frame, si.p, aperture)
     to_sensor = -view.ω
     lower, upper = frame.window
-    seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
     seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
     f = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(to_sensor), seen)
     W = value * f * particle_correction(si, to_sensor) / view.J_px
     seen &= dr.any(W != 0)
     seen &= ~scene.ray_test(si.spawn_ray_to(view.o), seen)
-    return _Sight(view, aperture, dr.select(seen, W, 0))
+    return _AtSensor(view, aperture, dr.select(seen, W, 0))
 
 
 @dr.syntax
-def walk_to_sensor(
-    job: Job, frame: SensorFrame, receivers: Receivers, sampler, limits: PathLimits, records: SubpathRecords
-) -> None:
+def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, records: SubpathRecords) -> None:
     """Trace the sensor subpaths of the receivers; fills `records`. Detached.
 
     `limits.max_depth`: vertices at most.
     """
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ctx, frame = mi.BSDFContext(mi.TransportMode.Importance), job.frame
     ray = mi.Ray3f(receivers.hit.o, receivers.hit.d, 0, receivers.wavelengths)
     pi = receivers.hit.intersection()
     value = mi.Spectrum(receivers.value)
@@ -214,10 +215,10 @@ def walk_to_sensor(
     while dr.hint(active, label="psdr.sensor_walk", exclude=[job, frame, limits]):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         bsdf = si.bsdf()
-        sight = _sight(job.scene, frame, sampler, si, bsdf, value * path.β, active)
+        end = _connect(job.scene, frame, sampler, si, bsdf, value * path.β, active)
         onward = bounce(si, bsdf, sampler, path, limits, ctx, active)
         following = onward.ray(si)
-        g_connect = deposit(a, si.n, sight.view.ω)
+        g_connect = deposit(a, si.n, end.view.ω)
         g_continue = _carried_off(job.form, a, si.n, -following.d)
         records.write(
             path.k - 1,
@@ -226,10 +227,10 @@ def walk_to_sensor(
                 g_connect,
                 g_continue,
                 a - g_connect,
-                sight.view.p,
-                sight.view.film,
-                sight.aperture,
-                sight.W,
+                end.view.p,
+                end.view.film,
+                end.aperture,
+                end.W,
             ),
             active,
         )

@@ -1,7 +1,7 @@
 """The demonstration on the Cornell box: a derivative image beside finite differences, and a recovered pose.
 
-The pose is recovered from the target image alone. Only the terms of `terms.TERMS` are in the
-gradient; what is missing biases single steps, but not the pose at which the images agree.
+The pose is recovered from the target image alone, by `optimize` in two stages. Only the terms of `terms.TERMS` are in
+the gradient; what is missing biases single steps, but not the pose at which the images agree.
 """
 
 from __future__ import annotations
@@ -18,58 +18,52 @@ import numpy as np
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import FiniteDifferences, finite_differences
 from psdr_jit.derivative.gradient import GradientResult, gradient
+from psdr_jit.inverse.loop import INTERRUPTED
+from psdr_jit.inverse.optimize import optimize
+from psdr_jit.inverse.variables import Pose
 from psdr_jit.scene import io as scene_io
 
 SCENE = "cbox.xml"
 PARAMETER = "small-box.vertex_positions"
 MAX_DEPTH = 4           # three bounces: enough for the look of the box, a third of the cost of eight
 TARGET_SPP = 256
-RATE = 0.03             # Adam's step at the start [scene units]
-LAST_RATE = 0.08        # its last step, relative to the first
-TURN_RATE = 1.5         # step of the angle [rad] relative to that of the position
+RATE = 0.03             # of position, Adam's step at the start [scene units]
+TURN_RATE = 2.6         # of the angle [degrees]
+LAST_RATE = 0.08        # the last steps, relative to the first
+ADAM = {"type": "adam", "beta_2": 0.99}     # a short memory: gradients shrink a hundredfold
+START = {"start_shift": (-0.38, 0.0, 0.15), "start_turn": (0.0, -20.0, 0.0)}    # [scene units], [degrees]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of the optimisation: coarse blocks see far, fine ones see well."""
+    """A part of the optimisation, a run of its own: coarse blocks see far, fine ones see well."""
 
-    until: float                # end, as a fraction of all iterations
     pools: tuple[int, ...]      # the loss compares means over (1/n x 1/n) parts of the image
-    turn: bool                  # whether the angle takes part: useless before the position is roughly right
+    turn_axes: str              # whether the angle takes part: useless before the position is roughly right
+    decay: float                # full steps while far away, then smaller ones so that noise averages out
 
 
-STAGES = (Stage(0.35, (4,), turn=False), Stage(1.0, (8, 32), turn=True))
-
-
-@dataclass(frozen=True)
-class Pose:
-    """Displacement of the box from the scene file's placement."""
-
-    x: float            # [scene units]
-    z: float
-    angle: float        # about the vertical axis through its centre [rad]
-
-
-START = Pose(x=-0.38, z=0.15, angle=-0.35)
+STAGES = (Stage((4,), turn_axes="", decay=1.0), Stage((8, 32), turn_axes="y", decay=LAST_RATE))
+FIRST_STAGE = 0.35      # its share of all iterations
 
 
 @dataclass
 class Recovery:
-    """What `recover_pose` did; the true pose is 0, 0, 0."""
+    """What `recover_pose` did. Offsets are those of the box from the scene file's placement."""
 
     target: np.ndarray      # images (H, W, C)
     first: np.ndarray
     last: np.ndarray
-    losses: list[float] = field(default_factory=list)
-    poses: list[Pose] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)   # of the last stage, in every stage
+    offsets: list[tuple[float, float]] = field(default_factory=list)   # distance [scene units], angle [degrees]
     px_per_unit: float = 0.0
 
     def shift_px(self, k: int) -> float:
         """Distance of the box from its true place at step `k`, in pixels at the box's distance."""
-        return math.hypot(self.poses[k].x, self.poses[k].z) * self.px_per_unit
+        return self.offsets[k][0] * self.px_per_unit
 
     def angle_degrees(self, k: int) -> float:
-        return math.degrees(abs(self.poses[k].angle))
+        return self.offsets[k][1]
 
 
 def load(res: int = 128) -> Any:
@@ -94,17 +88,13 @@ def compare(scene: Any, integrator: Any = None, spp: int = 16, seeds: int = 8, r
     return result, reference
 
 
-def place(original: Any, x: Any, z: Any, angle: Any) -> Any:
-    """Vertices (flat `mi.Float`) turned by `angle` about the vertical through their centre, then moved.
-
-    Attached where x, z and angle (width-1 `mi.Float`) are.
-    """
-    points = dr.unravel(mi.Point3f, original)
-    centre = mi.Point3f(dr.mean(points.x), 0, dr.mean(points.z))
-    p = points - centre
-    c, s = dr.cos(angle), dr.sin(angle)
-    moved = mi.Point3f(c * p.x + s * p.z + centre.x + x, p.y, c * p.z - s * p.x + centre.z + z)
-    return dr.ravel(moved)
+def offset(original: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
+    """How far vertices (V, 3) are from where they were: distance of their centres, and angle [degrees] about y."""
+    shift = moved.mean(0) - original.mean(0)
+    a, b = original - original.mean(0), moved - moved.mean(0)
+    # the rotation of the plane (x, z) that fits best in the sense of least squares
+    angle = math.atan2(np.sum(a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]), np.sum(a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]))
+    return float(np.linalg.norm(shift)), math.degrees(abs(angle))
 
 
 def pooled_loss(image: Any, target: Any, pools: tuple[int, ...]) -> Any:
@@ -120,50 +110,61 @@ def pooled_loss(image: Any, target: Any, pools: tuple[int, ...]) -> Any:
 
 def recover_pose(scene: Any, integrator: Any = None, iterations: int = 60, spp: int = 8,
                  progress: Callable[[int, int, Recovery], None] | None = None) -> Recovery:
-    """Displace the box by `START`, then bring it back by descending the image loss with Adam."""
+    """Displace the box by `START`, then bring it back by descending the image loss; the scene is left as it was."""
     spec = integrator_specs.integrator_spec(scene, integrator)
     differentiable, plain = integrator_specs.build(spec), integrator_specs.reference(spec)
     params = mi.traverse(scene)
     params.keep(PARAMETER)
     original = mi.Float(dr.detach(params[PARAMETER]))
 
-    def snapshot(spp: int, seed: int) -> Any:
+    def snapshot(spp: int, seed: int) -> np.ndarray:
         with dr.suspend_grad():
-            return mi.render(scene, integrator=plain, spp=spp, seed=seed)
+            return np.array(mi.render(scene, integrator=plain, spp=spp, seed=seed))
 
     target = snapshot(TARGET_SPP, iterations)
-    opt = mi.ad.Adam(lr=RATE, beta_2=0.99)     # a short memory: gradients shrink a hundredfold
-    for name in ("x", "z", "angle"):
-        opt[name] = mi.Float(getattr(START, name))
+    _displace(scene, params)
+    first = snapshot(TARGET_SPP // 4, iterations + 1)
+    history = Recovery(target, first, first, px_per_unit=_px_per_unit(scene))
 
-    def apply() -> None:
-        params[PARAMETER] = place(original, opt["x"], opt["z"], opt["angle"])
+    def note(*_: Any) -> None:
+        vertices = (np.array(dr.detach(value)).reshape(-1, 3) for value in (original, mi.traverse(scene)[PARAMETER]))
+        history.offsets.append(offset(*vertices))
+        if progress is not None and history.losses:
+            progress(len(history.losses), iterations, history)
+
+    note()
+    first_stage = math.ceil(FIRST_STAGE * iterations)
+    try:
+        for k, (stage, count) in enumerate(zip(STAGES, (first_stage, iterations - first_stage), strict=True)):
+            if count == 0:
+                continue
+            box = Pose(PARAMETER, RATE, shift_axes="xz", turn_axes=stage.turn_axes, turn_rate=TURN_RATE)
+            result = optimize(scene, box, target, loss=_noting_loss(stage, history), integrator=differentiable,
+                              progress=note, iterations=count, spp=spp, seed=k, decay=stage.decay, optimizer=ADAM)
+            if result.status == INTERRUPTED:
+                raise KeyboardInterrupt
+        history.last = snapshot(TARGET_SPP // 4, iterations + 1)
+    finally:
+        params[PARAMETER] = original
         params.update()
-
-    apply()
-    first = np.array(snapshot(TARGET_SPP // 4, iterations + 1))
-    history = Recovery(np.array(target), first, first, px_per_unit=_px_per_unit(scene))
-    for k in range(iterations):
-        stage = next(s for s in STAGES if k < s.until * iterations or s is STAGES[-1])
-        image = mi.render(scene, params, integrator=differentiable, spp=spp, seed=k)
-        loss = pooled_loss(image, target, stage.pools)
-        # reported: the last stage's loss, in every stage
-        shown = pooled_loss(dr.detach(image), target, STAGES[-1].pools)
-        history.losses.append(float(shown[0]))
-        history.poses.append(Pose(*(float(opt[n][0]) for n in ("x", "z", "angle"))))
-        dr.backward(loss)
-        # full steps while far away, then a smooth decay so that noise averages out
-        rate = RATE * LAST_RATE ** (max(0, 2 * k - iterations) / iterations)
-        opt.set_learning_rate({"x": rate, "z": rate, "angle": rate * TURN_RATE if stage.turn else 0.0})
-        opt.step()
-        apply()
-        if progress is not None:
-            progress(k + 1, iterations, history)
-    history.poses.append(Pose(*(float(opt[n][0]) for n in ("x", "z", "angle"))))
-    history.last = np.array(snapshot(TARGET_SPP // 4, iterations + 1))
-    params[PARAMETER] = original
-    params.update()
     return history
+
+
+def _displace(scene: Any, params: Any) -> None:
+    """Put the box where the recovery starts."""
+    box = Pose(PARAMETER, RATE, turn_axes="y", turn_rate=TURN_RATE, **START)
+    params[PARAMETER] = box.value(box.start(box.begin(scene, params), None))
+    params.update()
+
+
+def _noting_loss(stage: Stage, history: Recovery) -> Callable[[Any, Any], Any]:
+    """The loss of a stage, which notes that of the last one for comparison."""
+
+    def loss(image: Any, target: Any) -> Any:
+        history.losses.append(float(pooled_loss(dr.detach(image), target, STAGES[-1].pools)[0]))
+        return pooled_loss(image, target, stage.pools)
+
+    return loss
 
 
 def _px_per_unit(scene: Any) -> float:

@@ -83,20 +83,7 @@ def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
 
 def describe(result: Any, exr: Path, png: Path) -> str:
     """What was computed, in a few lines."""
-    import numpy as np
-
-    def line(name: str, image: Any, stderr: Any) -> str:
-        return (f"  {name:9s} mean {image.mean(): .4e}   rms {np.sqrt((image**2).mean()):.4e}   "
-                f"rms standard error {np.sqrt((stderr**2).mean()):.1e}")
-
-    plugin = result.integrator["type"]
-    lines = [f"d image / d {result.param}, {result.direction}",
-             f"  {plugin}, {result.seeds} seeds x {result.spp} spp, {result.seconds:.1f} s",
-             line("total", result.total, result.total_stderr)]
-    lines += [line(k, v, result.term_stderr[k]) for k, v in result.terms.items()]
-    if result.rejected:
-        lines.append(f"  {result.rejected} samples were not finite and were dropped")
-    return "\n".join([*lines, f"wrote {exr} and {png}"])
+    return f"{result}\nwrote {exr} and {png}"
 
 
 def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any]) -> int:

@@ -1,8 +1,9 @@
 """The `psdr` command: finds the subcommand, makes sure that LLVM works, maps errors to exit statuses.
 
-0 success; 1 a check failed; 2 wrong usage or input; 3 the machine lacks something; 130 interrupted. A
-subcommand is a module with `NAME`, `HELP`, `add_arguments(parser)` and `run(args) -> int`. It is imported
-only when it is the one asked for, so that `psdr --help` needs neither Mitsuba nor time.
+0 success; 1 a check did not pass, or an optimisation diverged; 2 wrong usage or input; 3 the machine lacks
+something, its disk is full, or something failed that nobody foresaw; 130 interrupted. A subcommand is a module with
+`NAME`, `HELP`, `add_arguments(parser)` and `run(args) -> int`. It is imported only when it is the one asked for, so
+that `psdr --help` needs neither Mitsuba nor time.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psdr_jit
-from psdr_jit.errors import PsdrError, SetupError
+from psdr_jit.errors import PsdrError, SetupError, StorageError
 
-OK, USAGE, SETUP_MISSING, INTERRUPTED = 0, 2, 3, 130
+OK, USAGE, SETUP_MISSING, UNFORESEEN, INTERRUPTED = 0, 2, 3, 3, 130
 TRACEBACK_VARIABLE = "PSDR_TRACEBACK"
 
 
@@ -113,42 +114,61 @@ def plain_warnings() -> Iterator[None]:
         yield
 
 
-def interrupted(error: BaseException | None) -> bool:
-    """Is Ctrl-C behind this error? Dr.Jit and Mitsuba wrap what is raised while they trace."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__ or error.__context__
-    return False
+def chain(error: BaseException) -> Iterator[BaseException]:
+    """An error and what is behind it: Dr.Jit and Mitsuba wrap what is raised while they trace."""
+    found: BaseException | None = error
+    while found is not None:
+        yield found
+        found = found.__cause__ or found.__context__
+
+
+def explained(error: BaseException) -> tuple[int, str]:
+    """Exit status and message of an error."""
+    behind = list(chain(error))
+    for found in behind if isinstance(error, RuntimeError) else [error]:
+        if isinstance(found, KeyboardInterrupt):
+            return INTERRUPTED, "interrupted"
+        if isinstance(found, PsdrError):
+            lacking = isinstance(found, (SetupError, StorageError))
+            return SETUP_MISSING if lacking else USAGE, f"error: {found}"
+        if isinstance(found, MemoryError) or "out of memory" in str(found):
+            return SETUP_MISSING, "error: out of memory: use fewer samples per pixel, or a smaller image"
+    if isinstance(error, ModuleNotFoundError) and (error.name or "psdr_jit").split(".")[0] != "psdr_jit":
+        return SETUP_MISSING, f"error: the package '{error.name}' is not installed; see: psdr doctor"
+    shown = behind[-1] if "see above" in str(error) else error  # so says Dr.Jit, and its user sees nothing above
+    text = " ".join(str(shown).split()) or "no more is known"
+    where = f"(not foreseen; {TRACEBACK_VARIABLE}=1 shows where)"
+    return UNFORESEEN, f"error: {type(shown).__name__}: {text} {where}"
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script."""
     try:
         with plain_warnings():
-            return dispatch(sys.argv[1:] if argv is None else argv, restart=argv is None)
-    except PsdrError as error:
-        if os.environ.get(TRACEBACK_VARIABLE) == "1":
-            traceback.print_exc()
-        print(f"psdr: error: {error}", file=sys.stderr)
-        return SETUP_MISSING if isinstance(error, SetupError) else USAGE
-    except ModuleNotFoundError as error:
-        if (error.name or "psdr_jit").split(".")[0] == "psdr_jit":
-            raise  # a defect of ours, not of the set-up
-        print(f"psdr: error: the package '{error.name}' is not installed; see: psdr doctor", file=sys.stderr)
-        return SETUP_MISSING
+            status = dispatch(sys.argv[1:] if argv is None else argv, restart=argv is None)
+            sys.stdout.flush()
+            return status
+    except BrokenPipeError:  # the reader (`| head`) has left
+        settle_output()
+        return OK
     except KeyboardInterrupt:
         print("psdr: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except RuntimeError as error:
-        if not interrupted(error):
-            raise
-        print("psdr: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        # The reader (`| head`) has left. Python would complain once more when it flushes at exit.
+    except Exception as error:  # noqa: BLE001  the last resort: whatever it is, it becomes one line
+        settle_output()
+        if os.environ.get(TRACEBACK_VARIABLE) == "1":
+            traceback.print_exc()
+        status, message = explained(error)
+        print(f"psdr: {message}", file=sys.stderr)
+        return status
+
+
+def settle_output() -> None:
+    """Drop what cannot be printed: Python would fail once more when it flushes at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
 
 
 if __name__ == "__main__":

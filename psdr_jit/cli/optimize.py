@@ -2,7 +2,7 @@
 
 Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
 checkpoint (a second one stops at once, without); --resume goes on from it with the same seeds and moments. Exit status:
-0 done or out of time, 1 the loss diverged, 2 wrong input, 130 interrupted.
+0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not be saved, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import _common
-from psdr_jit.errors import OptionError
+from psdr_jit.errors import OptionError, StorageError
 
 NAME = "optimize"
 HELP = "recover parameters of a scene from images"
@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         result = loop.run(problem, out, args.resume, report)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))
+    if result.lost:
+        raise StorageError(unsaved(result, out))
     return {loop.DIVERGED: DIVERGED, loop.INTERRUPTED: INTERRUPTED}.get(result.status, OK)
 
 
@@ -70,6 +72,20 @@ def describe(result: Any, out: Path, seconds: float) -> str:
     for name, now in result.offsets.items():
         for kind, value in now.items():
             lines.append(f"  {name}: {kind} from the scene file {result.start_offsets[name][kind]:.4g} -> {value:.4g}")
+    if result.lost:
+        return "\n".join(lines)
     left = "log and checkpoint are in {}; go on with --resume" if result.status == "interrupted" else (
         "log, pictures and values are in {}")  # fmt: skip
     return "\n".join([*lines, left.format(out)])
+
+
+def unsaved(result: Any, out: Path) -> str:
+    """Which final values are missing, and the way out."""
+    from psdr_jit.inverse import checkpoint, loop
+
+    (_, said), *more = result.lost.items()
+    also = f" (nor could {', '.join(name for name, _ in more)})" if more else ""
+    again = "run it again"
+    if (out / checkpoint.NAME).is_file() and result.status != loop.DIVERGED:
+        again = "go on with --resume"
+    return f"{said}{also}; then {again}"

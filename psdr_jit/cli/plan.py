@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table; 0."""
     _common.require_positive(spp=args.spp, max_depth=args.max_depth)
-    from psdr_jit.driver.prepare import make_plan
+    from psdr_jit.derivative.make_plan import make_plan
     from psdr_jit.scene import io as scene_io
 
     scene_io.use_variant(args.variant)

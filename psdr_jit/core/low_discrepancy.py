@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .varying import varying
+
 #: 2^-24: the upper 24 bits of a 32-bit integer as a number in [0, 1).
 _ULP = 2.0**-24
 
@@ -96,6 +98,6 @@ def lane_sampler(seed: mi.UInt32, lane: mi.UInt32) -> LaneSampler:
 
 def pixel_sampler(seed: mi.UInt32, lane: mi.UInt32, spp: int) -> LaneSampler:
     """A sequence for every pixel, where `spp` consecutive lanes belong to one."""
-    per_pixel = dr.opaque(mi.UInt32, spp)  # a literal would compile new kernels for every count
+    per_pixel = varying(mi.UInt32, spp)
     pixel = lane // per_pixel
     return LaneSampler(lane - pixel * per_pixel, mi.sample_tea_32(seed, pixel)[0])

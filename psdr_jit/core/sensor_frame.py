@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError
 from .film import sampled_window
+from .varying import varying
 
 KINDS = {
     "PerspectiveCamera": "perspective",
@@ -26,7 +27,7 @@ KINDS = {
 class SensorFrame:
     """Detached geometry of one sensor. Local space: the camera looks along +z from the origin.
 
-    Numbers that change with the pose, if only by rounding, are opaque: a camera that moves compiles no new kernels.
+    Numbers that change with the pose, if only by rounding, are `varying`.
     """
 
     kind: str
@@ -95,12 +96,12 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         kind=kind,
         to_world=to_world,
         to_local=to_local,
-        corner=dr.opaque(mi.Point2f, (x[0], y[0])),
-        extent=dr.opaque(mi.Point2f, (x[1] - x[0], y[2] - y[0])),
-        near=dr.opaque(mi.Float, near[0]),
-        far=dr.opaque(mi.Float, far),
-        focus=dr.opaque(mi.Float, focus),
-        aperture=dr.opaque(mi.Float, aperture),
+        corner=varying(mi.Point2f, (x[0], y[0])),
+        extent=varying(mi.Point2f, (x[1] - x[0], y[2] - y[0])),
+        near=varying(mi.Float, near[0]),
+        far=varying(mi.Float, far),
+        focus=varying(mi.Float, focus),
+        aperture=varying(mi.Float, aperture),
         crop_offset=tuple(film.crop_offset()),
         crop_size=tuple(film.crop_size()),
         stretch=_stretch(to_world),

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference, default_block
 from psdr_jit.derivative.gradient import DerivativeSampler, differentiable
@@ -64,8 +65,8 @@ class CheckResult:
     terms: tuple[str, ...]
     param: str
     direction: str
-    estimate: np.ndarray    # mean derivative image, (H, W, C)
-    reference: np.ndarray
+    estimate: np.ndarray = field(repr=False)    # mean derivative image, (H, W, C)
+    reference: np.ndarray = field(repr=False)
 
     @property
     def passed(self) -> bool:
@@ -153,6 +154,7 @@ def _judge_zero(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: i
     return outcome
 
 
+@one_at_a_time
 def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
                    index: int | None = None, integrator: Any = None, spp: int = 64, sensor: int = 0,
                    eps: float | None = None, reference_spp: int | None = None, block: int | None = None,

@@ -64,6 +64,7 @@ class CentralDifference:
         self.integrator = integrator_specs.reference(spec)
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
+        integrator_specs.require_samples(self.sensor, self.spp)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
         self.primal = GroupedImages(groups=1)
         self.seconds = 0.0
@@ -168,7 +169,7 @@ def default_step(perturbation: Perturbation, sensor: Any) -> float:
     target = np.array(p.centre if p.centre and p.info.kind != "camera" else box.center(), dtype=float)
     eye = np.array(sensor.world_transform() @ mi.Point3f(0)).ravel()[:3]
     radians_per_px = _pixel_angle(sensor)
-    size = float(np.linalg.norm(np.array(box.extents())))
+    size = float(np.linalg.norm(np.array(box.extents(), dtype=np.float64)))
     px = radians_per_px * max(float(np.linalg.norm(target - eye)), 0.1 * size)
     if p.rotation:
         angle = radians_per_px if p.info.kind == "camera" else px / (p.extent / 2 or 1.0)

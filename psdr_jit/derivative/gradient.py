@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages
@@ -22,7 +23,7 @@ from psdr_jit.scene.io import find_sensor
 MAX_GROUPS = 64     # images kept for the standard errors; more seeds share a group
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GradientResult:
     """Images are float64 arrays (H, W, C) in radiance per unit of the direction (radians for rotations)."""
 
@@ -47,11 +48,31 @@ class GradientResult:
             named[f"{term}_stderr"] = self.term_stderr[term]
         return named
 
+    def __repr__(self) -> str:
+        """One line a term instead of the arrays."""
+        plugin, count = self.integrator.get("type", "integrator"), f"{self.seeds} seed{'s' if self.seeds > 1 else ''}"
+        lines = [f"d image / d {self.param}, {self.direction}",
+                 f"  {plugin}, {count} x {self.spp} spp, {self.seconds:.1f} s",
+                 _line("total", self.total, self.total_stderr)]
+        lines += [_line(name, image, self.term_stderr[name]) for name, image in self.terms.items()]
+        if self.seeds < 2:
+            lines.append("  no standard errors: they come from the scatter of two seeds or more")
+        if self.rejected:
+            lines.append(f"  {self.rejected} samples were not finite and were dropped")
+        return "\n".join(lines)
+
     def metadata(self) -> dict[str, str]:
         """What was computed, as strings for an image header."""
         options = " ".join(f"{k}={v}" for k, v in self.integrator.items())
         return {"parameter": self.param, "direction": self.direction, "integrator": options,
                 "spp": str(self.spp), "seeds": str(self.seeds), "terms": " ".join(self.terms) or "total only"}
+
+
+def _line(name: str, image: np.ndarray, stderr: np.ndarray) -> str:
+    """Mean and size of an image [radiance per unit], and of its error where that is known."""
+    error = np.sqrt((stderr**2).mean())
+    known = f"   rms standard error {error:.1e}" if np.isfinite(error) else ""
+    return f"  {name:9s} mean {image.mean(): .4e}   rms {np.sqrt((image**2).mean()):.4e}{known}"
 
 
 class DerivativeSampler:
@@ -62,6 +83,7 @@ class DerivativeSampler:
         self.perturbation = perturbation
         self.integrator = integrator
         self.sensor = find_sensor(perturbation.scene, sensor)
+        integrator_specs.require_samples(self.sensor, spp)
         self.spp = spp
         self.images = GroupedImages(groups)
         self.not_finite = 0     # pixel values that arrived as NaN or inf
@@ -92,6 +114,7 @@ class DerivativeSampler:
         self.seconds += time.perf_counter() - start
 
 
+@one_at_a_time
 def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
              index: int | None = None, integrator: Any = None, spp: int = 64, seeds: int = 8, sensor: int = 0,
              progress: Callable[[int, int], None] | None = None) -> GradientResult:

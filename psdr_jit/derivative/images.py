@@ -5,6 +5,7 @@ Files are written beside their destination and renamed, so a reader never meets 
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from psdr_jit.core import files
 from psdr_jit.errors import OptionError
 
 ROBUST_PERCENTILE = 99.0    # of |value| where not zero: the end of the colour scale
 COLOUR_MAP = "RdBu_r"       # red positive, blue negative, white zero
+PROBE = 4096    # bytes that a folder must have room for: a disk that is full takes empty files
 CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
@@ -31,11 +34,10 @@ def check_writable(path: str | os.PathLike) -> Path:
     if path.exists() and not os.access(path, os.W_OK):
         raise OptionError(f"cannot write '{path}': the file is write-protected; choose another name")
     try:
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=".psdr-"):
-            pass
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".psdr-") as file:
+            file.write(bytes(PROBE))
     except OSError as error:
-        cause = error.strerror or error
-        raise OptionError(f"cannot write '{path}': {cause}; choose another folder") from error
+        raise files.refusal(path, error) from error
     return path
 
 
@@ -61,10 +63,21 @@ def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray],
     header.update({f"psdr_{k}": str(v) for k, v in (metadata or {}).items()})
 
     def write(temporary: str) -> None:
-        with OpenEXR.File(header, channels) as file:
+        with OpenEXR.File(header, dict(channels)) as file:  # it puts objects of its own into the dict
             file.write(temporary)
+        _require_whole(temporary, channels)
 
-    return _atomically(path, write)
+    return _replaced(path, write)
+
+
+def _require_whole(path: str, channels: Mapping[str, np.ndarray]) -> None:
+    """Raise `OSError` unless these channels are in the file: OpenEXR does not notice when its last block is lost."""
+    try:
+        found = read_exr(path)
+    except RuntimeError as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+    if not all(name in found and np.array_equal(found[name], channels[name], equal_nan=True) for name in channels):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _channels(prefix: str, image: np.ndarray) -> dict[str, np.ndarray]:
@@ -122,7 +135,7 @@ def save_figure(path: str | os.PathLike, figure: Any) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    return _atomically(path, lambda temporary: figure.savefig(temporary, format="png"))
+    return _replaced(path, lambda temporary: figure.savefig(temporary, format="png"))
 
 
 def robust_limit(images: Sequence[np.ndarray]) -> float:
@@ -146,19 +159,6 @@ def grey(image: np.ndarray) -> np.ndarray:
     return image if image.ndim == 2 else image[..., : min(3, image.shape[-1])].mean(-1)
 
 
-def _atomically(path: str | os.PathLike, write: Callable[[str], None]) -> Path:
-    """Let `write` fill a temporary file in the same folder, then rename it; nothing is left on failure."""
-    path = check_writable(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".psdr-", suffix=path.suffix)
-    os.close(handle)
-    try:
-        write(temporary)
-        # mkstemp files are private; give this one the mode any new file would have
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-    return path
+def _replaced(path: str | os.PathLike, write: Callable[[str], None]) -> Path:
+    """The file at `path`, whole or not at all; `OptionError` or `StorageError` otherwise."""
+    return files.replace(check_writable(path), write)

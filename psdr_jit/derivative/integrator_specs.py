@@ -16,7 +16,7 @@ import numpy as np
 
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
-from psdr_jit.options import FOLLOWS
+from psdr_jit.options import FOLLOWS, require_count, require_runtime
 from psdr_jit.plan.plan import Plan
 
 DEFAULT_INTEGRATOR = "psdr_path"
@@ -108,6 +108,15 @@ def reference(spec: Mapping[str, Any]) -> Any:
     return build({"type": "path", **{k: spec[k] for k in PATH_OPTIONS if k in spec}})
 
 
+def require_samples(sensor: Any, spp: int) -> None:
+    """Raise `OptionError` if a render of this many samples per pixel is more than a render can take; 0: its own."""
+    require_count("spp", spp)
+    film = sensor.film().crop_size()
+    samples = (spp or sensor.sampler().sample_count()) * int(film[0]) * int(film[1])
+    if not mi.variant().startswith("scalar"):  # those go pixel by pixel
+        require_runtime(0, samples)
+
+
 def rejected(integrator: Any) -> int | None:
     """Samples dropped as not finite so far, if the integrator counts them (`stats.rejected`)."""
     stats = getattr(integrator, "stats", None)
@@ -124,5 +133,9 @@ def to_image(tensor: Any) -> np.ndarray:
 
 
 def _last_line(error: Exception) -> str:
+    """The cause, which Mitsuba puts last; of unknown properties their names."""
+    unknown = re.findall(r'^\s*- \S+ "(\w+)":', str(error), re.MULTILINE)
+    if unknown:
+        return f"it has no property {', '.join(map(repr, unknown))}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else str(error)

@@ -8,17 +8,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.threads import one_at_a_time
 from ..driver.prepare import prepare
-from ..edges.table import scene_edges
+from ..edges.scene_table import scene_edges
 from ..errors import OptionError
 from ..plan.job import Job
 from ..plan.plan import EdgeCount, Plan, with_edges
 from ..plan.term import Term
+from ..scene.guard import require_derivatives
 from ..scene.io import find_sensor
 from ..scene.params import also_enabled
 from .integrator_specs import build, integrator_spec
 
 
+@one_at_a_time
 def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any = None, spp: int = 0) -> Plan:
     """What differentiating `scene` by the parameters with gradients enabled would do.
 
@@ -28,6 +31,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
     what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what rendering would raise:
     `OptionError`, `SceneError`, `UnsupportedError`.
     """
+    require_derivatives()
     view = find_sensor(scene, sensor)
     if not hasattr(integrator, "call"):
         integrator = build(integrator_spec(scene, integrator))
@@ -43,8 +47,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
 
 def _count(term: Term, job: Job) -> EdgeCount:
     table = scene_edges(job)
-    total = table.segment_count + table.buried + (dr.width(table.curves.rows.shape) if table.has_curves else 0)
     with dr.suspend_grad():
         weights = term.edges.weights(job)
-    sampled = 0 if weights is None else int(np.count_nonzero(np.array(weights)))
-    return EdgeCount(sampled, total, term.edges.left_out, table.buried)
+    sampled = sum(int(np.count_nonzero(np.array(w) > 0)) for w in weights)
+    return EdgeCount(sampled, table.count + table.buried, term.edges.left_out, table.buried)

@@ -15,7 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.errors import ParameterError, SceneError
+from psdr_jit.errors import ParameterError
+from psdr_jit.scene.guard import require_scene
+from psdr_jit.scene.names import traverse
 from psdr_jit.scene.params import ParamInfo, find_param, is_transform, values_to_keep
 
 
@@ -86,13 +88,13 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
       bounding box, or about its own origin for a sensor or a lamp;
     - `index=i`: one scalar of the parameter in flat order;
     - otherwise `direction` is one number, or as many as the parameter has scalars; default: all ones.
+
+    Numbers come as sequences, NumPy or Dr.Jit arrays.
     """
-    if not isinstance(scene, mi.Scene):
-        raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
-                         "load one with mi.load_file")
-    params = mi.traverse(scene)
+    require_scene(scene)
+    params = traverse(scene)
     info = find_param(scene, name, params)
-    _require_faces(params.properties[name][2])
+    name = info.name
     if index is not None and (isinstance(index, bool) or not isinstance(index, Integral)):
         raise ParameterError(f"index must be a whole number, got {index!r}")
     if sum(x is not None for x in (direction, rotate, index)) > 1:
@@ -111,12 +113,6 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     return _addition(common, base, direction, index)
 
 
-def _require_faces(node: Any) -> None:
-    """Mitsuba fails to update a mesh without faces."""
-    if isinstance(node, mi.Mesh) and node.face_count() == 0:
-        raise SceneError(f"mesh '{node.id()}' has no faces; remove it or fix its file")
-
-
 def _is_full_direction(direction: Any, base: Any) -> bool:
     """True when the direction has one number for each scalar of the parameter (and there are more than 3)."""
     if direction is None or is_transform(base):
@@ -125,8 +121,12 @@ def _is_full_direction(direction: Any, base: Any) -> bool:
 
 
 def _numbers(values: Any, what: str) -> np.ndarray:
+    """One dimension, float64, in the flat order of parameters: x y z x y z ... of a `mi.Vector3f`, too."""
+    if dr.is_array_v(values):
+        array = np.array(dr.detach(values), dtype=np.float64)
+        values = array.T if dr.depth_v(values) == 2 and not dr.is_tensor_v(values) else array
     try:
-        array = np.asarray(values, dtype=np.float64)
+        array = np.asarray(values, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
         raise ParameterError(f"{what} must be made of numbers, got {values!r}") from error
     if not np.all(np.isfinite(array)) or not np.any(array):
@@ -141,7 +141,7 @@ def _motion(common: dict, base: Any, direction: Any, rotate: Any) -> Perturbatio
         raise ParameterError(f"'{name}' needs a direction: direction=(dx, dy, dz) or rotate=(ax, ay, az) "
                              "(--direction / --rotate on the command line)")
     vector = _numbers(direction if rotate is None else rotate, "the direction of motion")
-    if vector.shape != (3,):
+    if vector.size != 3:
         raise ParameterError(f"the direction of '{name}' must have 3 numbers, got {vector.size}")
     centre, extent = _pivot(common, base)
     length = float(np.linalg.norm(vector))
@@ -173,12 +173,13 @@ def _pivot(common: dict, base: Any) -> tuple[tuple[float, ...], float]:
     if is_transform(base):
         if isinstance(node, mi.Shape):
             box = node.bbox()
-            return tuple(float(c) for c in box.center()), float(np.linalg.norm(np.array(box.extents())))
+            extents = np.array(box.extents(), dtype=np.float64)  # whose squares may exceed single precision
+            return tuple(float(c) for c in box.center()), float(np.linalg.norm(extents))
         origin = np.array(base @ mi.Point3f(0)).ravel()
         return tuple(float(c) for c in origin), 0.0
     if isinstance(base, mi.Point3f):
         return tuple(float(c) for c in np.array(base).ravel()), 0.0
-    points = np.array(base).reshape(-1, 3)
+    points = np.array(base, dtype=np.float64).reshape(-1, 3)
     lo, hi = points.min(0), points.max(0)
     return tuple(float(c) for c in (lo + hi) / 2), float(np.linalg.norm(hi - lo))
 
@@ -194,7 +195,7 @@ def _addition(common: dict, base: Any, direction: Any, index: int | None) -> Per
     elif direction is None:
         flat, label = np.ones(size), "all scalars by the same amount" if size > 1 else "its value"
     else:
-        flat, label = _numbers(direction, "the direction").ravel(), "a given direction"
+        flat, label = _numbers(direction, "the direction"), "a given direction"
         if flat.size not in (1, size):
             raise ParameterError(f"the direction of '{name}' must have 1 or {size} numbers, got {flat.size}")
         flat = np.broadcast_to(flat, (size,))

@@ -28,6 +28,7 @@ from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
+from ..scene.stale_normals import warn_about_stale_normals
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
 from .noise_log import NoiseLog
@@ -80,7 +81,9 @@ def prepare(call: Call) -> Prepared:
     budgets = _budgets(call) if given is None else {t.name: t.spp for t in given.terms}
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
-    require_supported(facts)
+    require_supported(facts, call.memory)
+    if call.mode == "backward":
+        warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())
     plan, log = _plan(question) if given is None else (_require_terms(given), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)

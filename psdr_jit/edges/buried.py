@@ -10,7 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import mesh_faces, mesh_positions
-from ..core.sensor_frame import SensorFrame, origin_box
+from ..core.sensor_frame import origin_box
+from ..core.varying import varying
 from ..plan.job import Job
 from ..scene.facts import EmitterFacts, ShapeFacts
 from .convexity import is_convex_body
@@ -24,23 +25,23 @@ MAX_FACES = 64
 DEPTH, ROUNDING = 1e-4, 1e-6
 
 
-def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts], frame: SensorFrame) -> mi.Bool | None:
+def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> mi.Bool | None:
     """Rows that lie inside of one of `bodies`. None if none of these can hide anything."""
     found = None
     for body in bodies:
-        if _may_hide(job, body, frame):
+        if _may_hide(job, body):
             inside = _is_inside(job.scene.shapes()[body.index], body, rows, job.facts.reach)
             found = inside if found is None else found | inside
     return found
 
 
-def _may_hide(job: Job, body: ShapeFacts, frame: SensorFrame) -> bool:
+def _may_hide(job: Job, body: ShapeFacts) -> bool:
     """Is this a body that no path gets into?"""
     shape = job.scene.shapes()[body.index]
     small = body.plugin == "sphere" or (body.is_mesh and body.faces <= MAX_FACES)
     if not body.opaque or body.is_emitter or body.has_medium or not small:
         return False
-    starts = [origin_box(frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
+    starts = [origin_box(job.frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
     outside = all(apart(*start, shape.bbox()) for start in starts)
     return outside and is_convex_body(shape, body, job.call.memory)
 
@@ -57,10 +58,10 @@ def _place(job: Job, index: int, facts: EmitterFacts) -> tuple:
 def _is_inside(shape: mi.Shape, facts: ShapeFacts, rows: EdgeRows, reach: float) -> mi.Bool:
     """Are both ends of an edge well inside of a convex body?"""
     box = shape.bbox()
-    depth = dr.opaque(mi.Float, DEPTH * float(dr.norm(box.extents())) + ROUNDING * reach)
+    depth = varying(mi.Float, DEPTH * float(dr.norm(box.extents())) + ROUNDING * reach)
     if facts.plugin == "sphere":
-        centre = dr.opaque(mi.Point3f, list(box.center()))
-        radius = dr.opaque(mi.Float, float(box.extents().x) / 2)
+        centre = varying(mi.Point3f, list(box.center()))
+        radius = varying(mi.Float, float(box.extents().x) / 2)
         return dr.maximum(dr.norm(rows.p0 - centre), dr.norm(rows.p1 - centre)) < radius - depth
     positions, faces = dr.detach(mesh_positions(shape)), mesh_faces(shape)
     a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in (faces.x, faces.y, faces.z))

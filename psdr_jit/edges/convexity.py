@@ -9,6 +9,7 @@ import numpy as np
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box, sensor_frame
+from ..core.varying import varying
 from ..scene.capabilities import SUPPORTED_SENSORS
 from ..scene.facts import SceneFacts, ShapeFacts
 from .overlaps import apart
@@ -69,5 +70,5 @@ def _is_behind_its_faces(mesh: mi.Mesh) -> bool:
     a, b, c = (dr.gather(mi.Point3f, positions, corners[k]) for k in range(3))
     normal = dr.normalize(dr.cross(b - a, c - a))
     height = dr.dot(normal, dr.gather(mi.Point3f, positions, pair % n) - a)
-    extent = dr.opaque(mi.Float, float(dr.norm(mesh.bbox().extents())))
+    extent = varying(mi.Float, float(dr.norm(mesh.bbox().extents())))
     return not dr.any(height > FLATNESS * extent)[0]

@@ -13,11 +13,10 @@ PROBE = 1e-2
 
 
 def bend(rows: JunctionRows, index: mi.UInt32, x: mi.Point3f, dx: mi.Vector3f, active):
-    """Carry a point of an arc's chord and its derivative onto the circle; `index` is `EdgeRows.junction`."""
-    on_arc = active & (index > 0)
-    radius = dr.gather(mi.Float, rows.arc_radius, index - 1, on_arc)
-    on_arc &= radius > 0
-    offset = x - dr.gather(mi.Point3f, rows.arc_centre, index - 1, on_arc)
+    """Carry a point of an arc's chord and its derivative onto the circle; `index`: row of `rows`."""
+    radius = dr.gather(mi.Float, rows.arc_radius, index, active)
+    on_arc = active & (radius > 0)
+    offset = x - dr.gather(mi.Point3f, rows.arc_centre, index, on_arc)
     distance = dr.norm(offset)
     axis = mi.Vector3f(offset / distance)
     scale = radius / distance
@@ -27,7 +26,7 @@ def bend(rows: JunctionRows, index: mi.UInt32, x: mi.Point3f, dx: mi.Vector3f, a
 
 def junction_motion(rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Point3f, active) -> mi.Vector3f:
     """Vector of value 0 whose derivative is the velocity of the curve at x, attached to both surfaces."""
-    sheets = [dr.gather(Sheet, sheet, index - 1, active) for sheet in (rows.a, rows.b)]
+    sheets = [dr.gather(Sheet, sheet, index, active) for sheet in (rows.a, rows.b)]
     n_a, n_b = (dr.select(s.is_ball, dr.normalize(mi.Vector3f(x - s.centre)), mi.Vector3f(s.n)) for s in sheets)
     moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, active)) for n, s in zip((n_a, n_b), sheets, strict=True))
     c = dr.dot(n_a, n_b)

@@ -238,7 +238,6 @@ def _upload(found: list[tuple]) -> JunctionTable:
         angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
         border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),
         traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
-        junction=_index(np.arange(1, count + 1)),
         shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),
         shell1=uploaded(mi.Float, np.where(arc, 0, b["shell"])),
         shape0=_index(a["index"]), shape1=_index(np.where(b["is_ball"], a["index"], b["index"])),

@@ -1,4 +1,4 @@
-"""The columns of the edge table: what is known of every straight edge, whatever it belongs to."""
+"""The columns of a table of edges between two faces: what is known of each, whatever the faces belong to."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ class EdgeRows:
     angle: mi.Float  # exterior angle [rad]
     blur: mi.Float  # how far beside the edge a ray may still meet its faces, by rounding [m]
     border: mi.Bool
-    seam: mi.Bool  # what the faces reflect may differ along the edge even where both are visible ...
-    smooth: mi.Bool  # ... though they share shading normals: a face that turns away from a light is in its own shadow
-    pattern: mi.Bool  # ... by more than the angle between them explains: textures or shading normals are split
+    seam: mi.Bool  # radiance may step here even where both faces are visible
+    smooth: mi.Bool  # the faces share their shading normals: such a step is where one turns away from a light, no more
+    pattern: mi.Bool  # textures or shading normals are split: such a step may be larger than the angle explains
     traced: mi.Bool  # several edges coincide here: what lies beside them is found by rays, not by topology
     moves: mi.Bool  # one of the faces can move
-    junction: mi.UInt32  # 1 + row of the edge set's junctions; 0: an edge of a mesh
     shell0: mi.Float  # of face 0. +1: closed surface, normals outward; −1: inward; 0: either side can be seen
     shell1: mi.Float
     shape0: mi.UInt32  # index into the edge set's meshes, of the first face ...

@@ -19,7 +19,7 @@ from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
-from .junctions import Ball, JunctionRows, Solid, find_junctions
+from .junctions import Ball, JunctionTable, Solid, find_junctions
 from .rows import EdgeRows, concatenate
 from .shells import edge_shells
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
@@ -51,20 +51,20 @@ TOPOLOGIES: Slot[dict[tuple[str, int, int], _MeshTopology]] = Slot(dict)
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """Straight edges of `meshes`, and the curves along which they cut into each other. `rows`: None without any."""
+    """Straight edges of `meshes`, and the curves along which these cut into each other. `rows`: None without any."""
 
     meshes: tuple[mi.Mesh, ...]
     rows: EdgeRows | None
     shapes: mi.ShapePtr | None  # by EdgeRows.shape0 and shape1
-    junctions: JunctionRows | None  # by EdgeRows.junction
+    junctions: JunctionTable | None  # curves along which the meshes cut into each other, or balls into them
     normals: mi.Normal3f | None  # by vertex, 0 on flat-shaded meshes; None if all are
 
 
 def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: tuple[Ball, ...] = ()) -> EdgeSet:
     """Edges of `meshes` in their present state; topologies are kept in `memory` from call to call.
 
-    Intersection curves of meshes with each other and with `balls` are appended as rows of their own. Coinciding edges
-    of shapes that all move, or all rest (`moving`), become one row: `join_coinciding`.
+    Intersection curves of meshes with each other and with `balls` have rows of their own. Coinciding edges of shapes
+    that all move, or all rest (`moving`), become one row: `join_coinciding`.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
@@ -79,12 +79,10 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: t
         solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
         first_vertex += dr.width(positions)
     rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
-    found = find_junctions(solids, balls, memory)
-    if found is not None:
-        rows = concatenate([rows, found.edges])
+    junctions = find_junctions(solids, balls, memory)
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
     dr.eval(rows)
-    return EdgeSet(tuple(meshes), rows, shapes, None if found is None else found.rows, _normals(meshes))
+    return EdgeSet(tuple(meshes), rows, shapes, junctions, _normals(meshes))
 
 
 def _normals(meshes: list[mi.Mesh]) -> mi.Normal3f | None:
@@ -207,7 +205,6 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         pattern=jumps,
         traced=dr.full(mi.Bool, False, n),
         moves=dr.full(mi.Bool, moves, n),
-        junction=dr.zeros(mi.UInt32, n),
         shell0=topology.shell,
         shell1=topology.shell,
         shape0=dr.full(mi.UInt32, shape, n),

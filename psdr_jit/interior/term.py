@@ -51,7 +51,7 @@ MOST_PATHS = 0.6
 
 
 @dataclass(frozen=True)
-class _Pass:
+class CameraPass:
     """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
 
     spp: int
@@ -74,7 +74,7 @@ class _CameraSampler:
         return self._spp
 
 
-def _camera_passes(job: Job) -> Iterator[_Pass]:
+def camera_passes(job: Job) -> Iterator[CameraPass]:
     """Camera rays, in passes whose path records fit into `record_mib`."""
     film = job.film
     lower, upper = films.sampled_window(film)
@@ -84,7 +84,7 @@ def _camera_passes(job: Job) -> Iterator[_Pass]:
         films.clear(film)
         sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
         ray, weight, pos = job.call.integrator.sample_rays(job.scene, job.sensor, sampler)
-        yield _Pass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
+        yield CameraPass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
 
 
 def every_path_differs(job: Job) -> bool:
@@ -116,7 +116,7 @@ def _limits(job: Job) -> PathLimits:
     return replace(limits, uniform_share=UNIFORM_SHARE) if facts.geometry_moves else limits
 
 
-def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
+def _along_the_walk(job: Job, p: CameraPass) -> mi.Spectrum:
     """Derivative of every path's radiance by the materials and lights it meets, without records."""
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
     sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
@@ -126,7 +126,7 @@ def _along_the_walk(job: Job, p: _Pass) -> mi.Spectrum:
     return job.call.counters.rejected.keep_finite(sink.dL)
 
 
-def _record(job: Job, p: _Pass) -> tuple[PathRecords, mi.UInt32]:
+def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
     facts, limits = job.facts, _limits(job)
     if limits.max_depth == 0:
@@ -168,7 +168,7 @@ def flow_of(job: Job) -> Flow:
     return (FLOWS[job.form] if moves else RestingFlow)(job.scene, traits)
 
 
-def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
+def _skipped(job: Job, p: CameraPass, records: PathRecords) -> mi.Float:
     """How far the recorded camera rays start beyond the sensor's own: behind hidden emitters, 0 otherwise [m]."""
     if not job.options.hide_emitters:
         return mi.Float(0)
@@ -176,7 +176,7 @@ def _skipped(job: Job, p: _Pass, records: PathRecords) -> mi.Float:
     return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
 
 
-def _derivatives(job: Job, p: _Pass) -> mi.Spectrum:
+def _derivatives(job: Job, p: CameraPass) -> mi.Spectrum:
     """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
     if paths_rest(job):
         return _along_the_walk(job, p)
@@ -197,7 +197,7 @@ def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
     image = 0
     with dr.suspend_grad():
-        for p in _camera_passes(job):
+        for p in camera_passes(job):
             dL = _derivatives(job, p)
             image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
     return image
@@ -206,7 +206,7 @@ def forward(job: Job) -> mi.TensorXf:
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
     with dr.suspend_grad():
-        for p in _camera_passes(job):
+        for p in camera_passes(job):
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue

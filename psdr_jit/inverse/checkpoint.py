@@ -5,9 +5,8 @@ Sampling needs no state: seeds follow from the run's seed and the iteration's nu
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from psdr_jit.errors import CheckpointError
+from psdr_jit.core import files
+from psdr_jit.errors import CheckpointError, StorageError
 from psdr_jit.inverse.variables import like, numbers
 
 FORMAT = 1
@@ -38,32 +38,27 @@ class Checkpoint:
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write beside `path`, flush to the disk, then replace. Raises `CheckpointError`; the old file is then intact."""
-    temporary = None
+    header = {"format": FORMAT, "iteration": checkpoint.iteration, "fingerprint": checkpoint.fingerprint,
+              "seconds": checkpoint.seconds}  # fmt: skip
+    parts = {"now": checkpoint.arrays, "best": checkpoint.best, "history": checkpoint.history}
+    named = {f"{part}/{key}": value for part, found in parts.items() for key, value in found.items()}
+    content = io.BytesIO()
+    np.savez(content, header=json.dumps(header), **named)
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".checkpoint-", suffix=".npz")
-        with os.fdopen(handle, "wb") as file:
-            header = {"format": FORMAT, "iteration": checkpoint.iteration, "fingerprint": checkpoint.fingerprint,
-                      "seconds": checkpoint.seconds}  # fmt: skip
-            parts = {"now": checkpoint.arrays, "best": checkpoint.best, "history": checkpoint.history}
-            named = {f"{part}/{key}": value for part, found in parts.items() for key, value in found.items()}
-            np.savez(file, header=json.dumps(header), **named)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise CheckpointError(
-            f"the checkpoint '{path}' could not be written ({error.strerror or error}); the one before "
-            "is intact; make room or choose another folder"
-        ) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
+        files.write_bytes(path, content.getvalue())
+    except StorageError as error:
+        raise CheckpointError(f"{error}; the checkpoint before it is intact") from error
+
+
+def require(path: Path) -> None:
+    """Raise `CheckpointError` unless there is one."""
+    if not path.is_file():
+        raise CheckpointError(f"there is no checkpoint '{path}' to resume from; start without resuming")
 
 
 def load(path: Path, fingerprint: str) -> Checkpoint:
     """Raises `CheckpointError` unless there is a complete one of the same problem."""
-    if not path.is_file():
-        raise CheckpointError(f"there is no checkpoint '{path}' to resume from; start without resuming")
+    require(path)
     try:
         with np.load(path) as file:
             header = json.loads(str(file["header"]))

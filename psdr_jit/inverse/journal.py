@@ -2,13 +2,14 @@
 
 `log.jsonl` has one object per iteration; `checkpoint.npz` the state; `snapshots/` images; `result.png` a strip of the
 images before and after; `curves.png` loss and offsets; `final.npz` the values of all variables, meshes as PLY.
-A full disk does not end a run: what could not be written is warned about, once each, and named in the result.
+All but the log are written beside and renamed. A full disk does not end a run: what could not be written is warned
+about, once each, and named in the result; the final values that are missing are named apart.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -18,9 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core import files
 from psdr_jit.core.compat import VERTEX_POSITIONS
 from psdr_jit.derivative import images
-from psdr_jit.errors import CheckpointError, OptionError
+from psdr_jit.errors import CheckpointError, OptionError, StorageError
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
 from psdr_jit.inverse.variables import numbers
@@ -38,6 +40,7 @@ class Journal:
     def __init__(self, folder: Path | None, problem: Any, keep: int) -> None:
         self.folder = folder
         self.not_written: list[str] = []
+        self.lost: dict[str, str] = {}  # files with final values that are missing, and why
         self._rows: list[dict[str, Any]] = []
         self._initial: list[np.ndarray] = []
         self._log: Any = None
@@ -47,19 +50,22 @@ class Journal:
             (folder / "snapshots").mkdir(parents=True, exist_ok=True)
             images.check_writable(folder / "log.jsonl")
             self._rows = [row for row in _rows(folder / "log.jsonl") if row["iteration"] < keep]
-            kept = folder / ".log.jsonl"  # renamed once it is complete: a full disk must not cost the history
-            kept.write_text("".join(json.dumps(row) + "\n" for row in self._rows), encoding="utf-8")
-            os.replace(kept, folder / "log.jsonl")
+            kept = "".join(json.dumps(row) + "\n" for row in self._rows).encode()
+            files.write_bytes(folder / "log.jsonl", kept)  # a full disk must not cost the history
             self._log = open(folder / "log.jsonl", "a", encoding="utf-8")  # open as long as the run
+        except StorageError:
+            raise
         except OSError as error:
-            raise OptionError(
-                f"cannot write to the folder '{folder}': {error.strerror or error}; choose another"
-            ) from error
+            raise files.refusal(folder, error) from error
 
     def close(self) -> None:
-        """Close the log."""
-        if self._log is not None:
-            self._try("log.jsonl", self._log.close)
+        """Close the log; one that has nothing in it is removed."""
+        if self._log is None:
+            return
+        self._try("log.jsonl", self._log.close)
+        log = self.folder / "log.jsonl"
+        if log.is_file() and log.stat().st_size == 0:
+            log.unlink()
 
     def step(self, iteration: int, loss: float, norms: dict[str, float], seconds: float, views: list[int], rate: float,
              offsets: dict[str, dict[str, float]]) -> None:  # fmt: skip
@@ -81,9 +87,10 @@ class Journal:
 
         self._try("log.jsonl", write)
 
-    def keep(self, checkpoint: checkpoints.Checkpoint) -> None:
-        """Replace the checkpoint."""
-        self._try(checkpoints.NAME, lambda: checkpoints.save(self.folder / checkpoints.NAME, checkpoint))
+    def keep(self, checkpoint: checkpoints.Checkpoint, last: bool = False) -> None:
+        """Replace the checkpoint; the `last` one holds what the run has found."""
+        write = self.value if last else self._try
+        write(checkpoints.NAME, lambda: checkpoints.save(self.folder / checkpoints.NAME, checkpoint))
 
     def snapshot(self, iteration: int, problem: Any, found: dict[int, np.ndarray]) -> None:
         """The images that the loss has seen, beside their targets."""
@@ -105,28 +112,35 @@ class Journal:
             self._initial = [_look(problem, view) for view in problem.views[:SHOWN]]
 
     def finish(self, problem: Any, result: Any) -> None:
-        """Pictures and final values."""
+        """Final values, then pictures: the last room on a disk is for what matters."""
         if self.folder is None:
             return
+        for name, content in {**_values(problem), "result.json": _summary(result)}.items():
+            self.value(name, lambda name=name, content=content: files.write_bytes(self.folder / name, content))
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
         self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
-        self._try("final.npz", lambda: _write_values(self.folder, problem))
-        self._try(
-            "result.json", lambda: (self.folder / "result.json").write_text(json.dumps(_summary(result), indent=1))
-        )
 
-    def _try(self, what: str, write: Callable[[], Any]) -> None:
+    def value(self, what: str, write: Callable[[], Any]) -> None:
+        """Write something without which the run was in vain."""
+        failed = self._try(what, write)
+        if failed is not None:
+            self.lost[what] = str(failed)
+
+    def _try(self, what: str, write: Callable[[], Any]) -> Exception | None:
+        """The error, if there was one."""
         if self.folder is None:
-            return
+            return None
         try:
             write()
         except (OSError, RuntimeError, OptionError, CheckpointError) as error:  # RuntimeError: OpenEXR and Mitsuba
             if what not in self.not_written:
                 self.not_written.append(what)
-                said = f"'{self.folder / what}' was not written: {error}; the optimisation goes on"
-                warnings.warn(said, RuntimeWarning, stacklevel=4)
+                named = "" if str(self.folder / what) in str(error) else f"'{self.folder / what}' was not written: "
+                warnings.warn(f"{named}{error}; the optimisation goes on", RuntimeWarning, stacklevel=4)
+            return error
+        return None
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
@@ -150,13 +164,18 @@ def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray]) -> 
         images.write_exr(folder / f"{iteration:06d}_{name}.exr", {name: layer})
 
 
-def _write_values(folder: Path, problem: Any) -> None:
-    """Values by parameter: poses as (4, 4), vertices as (V, 3), everything else in its own shape."""
-    np.savez(folder / "final.npz", **{name: _value(name, problem.params[name]) for name in problem.variables})
+def _values(problem: Any) -> dict[str, bytes]:
+    """Files by name: values by parameter (poses (4, 4), vertices (V, 3), the rest in its own shape), and meshes."""
+    values = io.BytesIO()
+    np.savez(values, **{name: _value(name, problem.params[name]) for name in problem.variables})
+    found = {"final.npz": values.getvalue()}
     for name in problem.variables:
         node = problem.params.properties[name][2]
         if name.endswith(VERTEX_POSITIONS) and isinstance(node, mi.Mesh):
-            node.write_ply(str(folder / f"{node.id()}.ply"))
+            mesh = mi.MemoryStream()  # not a file: Mitsuba does not notice when the last of it is lost
+            node.write_ply(mesh)
+            found[f"{node.id()}.ply"] = mesh.raw_buffer()
+    return found
 
 
 def _value(name: str, value: Any) -> np.ndarray:
@@ -168,7 +187,8 @@ def _value(name: str, value: Any) -> np.ndarray:
     return flat.reshape(-1, 3) if name.endswith(VERTEX_POSITIONS) else flat
 
 
-def _summary(result: Any) -> dict[str, Any]:
+def _summary(result: Any) -> bytes:
     loss = result.loss if np.isfinite(result.loss) else None
-    return {"status": result.status, "iterations": result.iterations, "seconds": result.seconds, "loss": loss,
-            "offset": result.offsets, "start_offset": result.start_offsets}  # fmt: skip
+    found = {"status": result.status, "iterations": result.iterations, "seconds": result.seconds, "loss": loss,
+             "offset": result.offsets, "start_offset": result.start_offsets}  # fmt: skip
+    return json.dumps(found, indent=1).encode()

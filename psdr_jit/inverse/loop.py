@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,8 +15,11 @@ import numpy as np
 
 from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
+from psdr_jit.inverse import lock
 from psdr_jit.inverse.checkpoint import Checkpoint
+from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
+from psdr_jit.inverse.interruption import interruptible
 from psdr_jit.inverse.journal import Journal
 from psdr_jit.inverse.problem import Latents, Problem, copied
 from psdr_jit.inverse.variables import like, numbers
@@ -37,12 +37,13 @@ class Result:
     status: str  # "finished", "out of time", "diverged" or "interrupted"
     iterations: int  # that have been done, in all runs together
     seconds: float  # of all runs together, without reading and checking the problem
-    losses: list[float]  # by iteration of this run, before its step
+    losses: list[float] = field(repr=False)  # by iteration of this run, before its step
     loss: float  # mean of the last few; NaN without any
-    latents: Latents  # detached
+    latents: Latents = field(repr=False)  # detached
     offsets: dict[str, dict[str, float]]  # from the scene's own values, now ...
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
-    not_written: list[str] = field(default_factory=list)  # what the disk did not take
+    not_written: list[str] = field(default_factory=list)  # what the disk did not take ...
+    lost: dict[str, str] = field(default_factory=dict)  # ... and of that the final values, with the reason
 
 
 @dataclass
@@ -71,6 +72,14 @@ def run(
 ) -> Result:
     """Optimise; with a `folder`, log there, checkpoint, and `resume` from it. See `psdr_jit.optimize`."""
     require_folder(folder, resume)
+    if folder is None:
+        return _run(problem, None, False, progress)
+    with lock.held(folder):
+        require_folder(folder, resume, mine=True)  # a run may have ended here in between
+        return _run(problem, folder, resume, progress)
+
+
+def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> Result:
     state = _begin(problem)
     if resume:
         _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
@@ -83,7 +92,7 @@ def run(
             warnings.simplefilter("ignore", ZeroDerivativeWarning)
             status = _loop(problem, state, journal, losses, progress)
         if status != DIVERGED:
-            journal.keep(_checkpoint(problem, state))
+            journal.keep(_checkpoint(problem, state), last=status == INTERRUPTED)
         found = copied(state.history.best if status == DIVERGED else state.latents)
         problem.apply(found)
         start = problem.offsets(problem.start())
@@ -92,16 +101,23 @@ def run(
         )
         if status != INTERRUPTED:
             journal.finish(problem, result)
-        result.not_written = journal.not_written
     finally:
         journal.close()
+    result.not_written, result.lost = journal.not_written, journal.lost
     return result
 
 
-def require_folder(folder: Path | None, resume: bool) -> None:
-    """Raise `OptionError` if there is nothing to resume from, or an earlier run that would be overwritten."""
+def require_folder(folder: Path | None, resume: bool, mine: bool = False) -> None:
+    """Raise typed errors if there is nothing to resume from, a run that would be overwritten, or one at work there.
+
+    `mine`: its lock is held by the caller.
+    """
     if resume and folder is None:
         raise OptionError("resuming needs the folder of the run that was interrupted")
+    if folder is not None and not mine:
+        lock.require_free(folder)
+    if resume:
+        checkpoints.require(folder / checkpoints.NAME)
     if not resume and folder is not None and (folder / checkpoints.NAME).exists():
         raise OptionError(
             f"'{folder}' holds an earlier run: go on with it by resuming (--resume), choose another folder (--out), or "
@@ -115,6 +131,7 @@ class Stepper:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._state = _begin(problem)
+        problem.apply(self._state.latents)
         self._journal = Journal(None, problem, keep=0)
 
     def step(self) -> float:
@@ -135,21 +152,20 @@ class Stepper:
 
 def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float], progress: Any) -> str:
     """Iterate until there is a reason to stop, and return it."""
-    settings, history = problem.settings, state.history
-    with _interruptible() as interrupted:
+    settings = problem.settings
+    problem.apply(problem.start())
+    watch = Watch(problem)  # of where the run began, also when it is resumed
+    problem.apply(state.latents)
+    with interruptible() as interrupted:
         while state.iteration < settings.iterations:
             if interrupted:
                 return INTERRUPTED
             if settings.max_seconds is not None and state.clock() > settings.max_seconds:
                 return OUT_OF_TIME
             losses.append(_iterate(problem, state, journal))
-            if history.diverges(settings.diverged_factor):
-                _say_diverged(state, f"the loss diverged (now {losses[-1]:.3e}, at first {history.scale:.3e})")
-                return DIVERGED
-            broken = [name for name, norm in state.norms.items() if not math.isfinite(norm)]
-            if any(state.lost[name] >= settings.stalled_after for name in broken):
-                _say_diverged(state, f"the gradient of {', '.join(broken)} has not been finite for "
-                                     f"{settings.stalled_after} iterations")  # fmt: skip
+            lost = _is_lost(problem, state) or watch.reason(problem, state.latents, state.lost, state.iteration)
+            if lost:
+                _say_diverged(state, lost)
                 return DIVERGED
             state.iteration += 1
             if state.iteration % settings.checkpoint_every == 0:
@@ -157,6 +173,20 @@ def _loop(problem: Problem, state: _State, journal: Journal, losses: list[float]
             if progress is not None:
                 progress(state.iteration, settings.iterations, _note(problem, state, losses))
     return FINISHED
+
+
+def _is_lost(problem: Problem, state: _State) -> str:
+    """What the losses and gradients say against going on, or ""."""
+    history, patience = state.history, problem.settings.stalled_after
+    if history.diverges(problem.settings.diverged_factor):
+        return f"the loss diverged (now {history.recent[-1]:.3e}, at first {history.scale:.3e})"
+    if history.regressed:
+        return (f"the loss has been above the first ones for {history.above} iterations (now {history.mean:.3e}) and "
+                f"was {history.best_loss:.3e} before")  # fmt: skip
+    broken = [name for name, norm in state.norms.items() if not math.isfinite(norm)]
+    if any(state.lost[name] >= patience for name in broken):
+        return f"the gradient of {', '.join(broken)} has not been finite for {patience} iterations"
+    return ""
 
 
 def _note(problem: Problem, state: _State, losses: list[float]) -> str:
@@ -171,25 +201,6 @@ def _say_diverged(state: _State, what: str) -> None:
     known = f"the best state (loss {best:.3e})" if math.isfinite(best) else "the start"
     said = f"{what} at iteration {state.iteration}: stopped, {known} is kept; lower the learning rates, or raise spp"
     warnings.warn(said, RuntimeWarning, stacklevel=5)
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Ctrl-C fills the list instead of stopping between two variables of a step; pressed again, it stops at once."""
-    seen: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        seen.append(number)
-        signal.signal(signal.SIGINT, before)
-
-    if threading.current_thread() is not threading.main_thread():  # only that one receives signals
-        yield seen
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield seen
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _begin(problem: Problem) -> _State:
@@ -226,16 +237,16 @@ def _checkpoint(problem: Problem, state: _State) -> Checkpoint:
 
 
 def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
-    """One step of every optimiser; the loss before it."""
+    """One step of every optimiser, from where the scene stands; the loss before it."""
     start = time.perf_counter()
     before = copied(state.latents)
-    problem.apply(state.latents)
     loss, images = problem.evaluate(state.iteration)
     state.history.add(loss, before)
     rate = problem.rate(state.iteration)
     state.norms = {}
     for name, variable in problem.variables.items():
         _step(problem, state, name, variable, rate)
+    problem.apply(state.latents)
     journal.step(
         state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
         problem.offsets(before),

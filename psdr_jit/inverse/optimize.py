@@ -9,6 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse import loop
 from psdr_jit.inverse.problem import make_problem
@@ -16,6 +17,7 @@ from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.variables import Variable
 
 
+@one_at_a_time
 def optimize(
     scene: mi.Scene,
     variables: Variable | Sequence[Variable],

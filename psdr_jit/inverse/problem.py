@@ -18,6 +18,8 @@ from psdr_jit.inverse.losses import Loss, find_loss
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
 from psdr_jit.inverse.variables import Variable
+from psdr_jit.scene.guard import require_derivatives, require_integrator, require_scene
+from psdr_jit.scene.names import stable_name, traverse
 from psdr_jit.scene.params import is_transform, parameter_value
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
@@ -151,24 +153,28 @@ def make_problem(
     settings: Settings,
 ) -> Problem:
     """Everything checked; raises typed errors before anything is rendered in a loop."""
-    if not isinstance(scene, mi.Scene):
-        raise ParameterError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    require_derivatives()
+    require_scene(scene)
     chosen = list(variables) if isinstance(variables, Sequence) else [variables]
     names = [v.parameter for v in chosen]
     if not chosen:
         raise OptionError("there is no variable: name at least one scene parameter to optimise")
-    twice = sorted({name for name in names if names.count(name) > 1})
+    keys = [stable_name(scene, name) for name in names]
+    twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
         raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
     found = tuple(views(scene, targets))
-    params = mi.traverse(scene)
+    for view in found:
+        integrator_specs.require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
+    params = traverse(scene, names)
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:
         for latent, rate in variable.learning_rates.items():
-            if not rate > 0:
+            if not 0 < rate < np.inf:
                 raise OptionError(
-                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0, got {rate}"
+                    f"'{variable.parameter}': the learning rate of its {latent} must be above 0 and finite, got {rate}"
                 )
+    require_integrator(integrator)
     if not hasattr(integrator, "render_backward"):
         integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, integrator))
     by_name = {v.parameter: v for v in chosen}

@@ -24,6 +24,9 @@ TARGET_SEED = 0x7A26E7
 #: Samples per pixel of a target that are rendered at once.
 PASS = 256
 
+#: Luminance of linear Rec. 709 colours, by channel, as in Mitsuba.
+LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
+
 
 @dataclass(frozen=True)
 class View:
@@ -105,19 +108,33 @@ def sensor_name(scene: mi.Scene, sensor: mi.Sensor) -> str:
 def read_image(path: str | os.PathLike, channels: int = 3) -> np.ndarray:
     """An image file as linear values (H, W, C), in 1 (luminance), 3 (RGB) or 4 channels (with alpha).
 
-    Of an EXR file with several layers, the default one counts.
+    Of an EXR file with several layers, the default one counts. A file with one channel of whatever name is grey; where
+    luminance is wanted, colours are mixed to it.
     """
     path = Path(path)
     if not path.is_file():
         raise OptionError(f"image file '{path}' does not exist: check the path")
     try:
         if path.suffix.lower() == ".exr":
-            found = images.read_exr(path)
-            return np.stack([found[name] for name in images.CHANNELS[channels]], axis=-1)
+            return _picked(path, images.read_exr(path), channels)
         formats = mi.Bitmap.PixelFormat
         wanted = {1: formats.Y, 4: formats.RGBA}.get(channels, formats.RGB)
         return np.array(mi.Bitmap(os.fspath(path)).convert(wanted, mi.Struct.Type.Float32, srgb_gamma=False))
-    except KeyError as error:
-        raise OptionError(f"image file '{path}' has no channel {error}; it has {', '.join(found)}") from error
     except (OSError, RuntimeError) as error:
         raise OptionError(f"image file '{path}' cannot be read: {str(error).splitlines()[-1].strip()}") from error
+
+
+def _picked(path: Path, found: dict[str, np.ndarray], channels: int) -> np.ndarray:
+    """So many channels (H, W, C) out of those of a file."""
+    names = images.CHANNELS.get(channels, ())
+    if names and all(name in found for name in names):
+        return np.stack([found[name] for name in names], axis=-1)
+    if len(found) == 1 and channels in (1, 3):
+        (grey,) = found.values()
+        return np.repeat(grey[..., None], channels, axis=-1)
+    if channels == 1 and all(name in found for name in LUMINANCE):
+        return sum(weight * found[name] for name, weight in LUMINANCE.items())[..., None]
+    raise OptionError(
+        f"image file '{path}' has the channels {', '.join(found)}, but the sensor renders "
+        f"{', '.join(names) or f'{channels} channels'}: save the image with those, or set the film's pixel_format"
+    )

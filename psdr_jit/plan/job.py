@@ -7,13 +7,17 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
-from ..core.memory import Memory
+from ..core.memory import Memory, Slot
+from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..options import Options
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from .call import Call
 from .motion import Motion
 from .plan import Plan
+
+#: Of one render call: the geometry of its sensor.
+FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,13 @@ class Job:
     def form(self) -> str:
         """What path vertices do while θ changes, see `options.FORMS`."""
         return self.plan.form
+
+    @property
+    def frame(self) -> SensorFrame:
+        """Geometry of the sensor, read once per render call."""
+        if self.shared[FRAME] is None:
+            self.shared[FRAME] = sensor_frame(self.sensor)
+        return self.shared[FRAME]
 
     @property
     def limits(self) -> PathLimits:

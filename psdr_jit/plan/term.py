@@ -25,7 +25,7 @@ Verdict = tuple[bool, str]
 class EdgeSampling:
     """Of a boundary term: which edges it samples."""
 
-    weights: Callable[[Job], mi.Float | None]  # by row of the edge table, not normalised; None: there are none
+    weights: Callable[[Job], list[mi.Float]]  # by kind of edge, of its rows: not normalised
     left_out: str  # why the others are not sampled
 
 

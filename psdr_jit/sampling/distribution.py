@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.varying import varying
+
 
 @dataclass
 class EdgeDistribution:
@@ -31,18 +33,9 @@ def edge_distribution(weight: mi.Float) -> EdgeDistribution:
     return EdgeDistribution(cdf, weight, total)
 
 
-def distribution_of(weights: list[mi.Float]) -> EdgeDistribution | None:
-    """Distribution over the concatenated weights of straight rows and curve rows; None if all vanish."""
-    if not weights:
-        return None
-    distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
-    return distribution if float(distribution.total[0]) > 0 else None
-
-
 def stratified(count: int, jitter: mi.Float) -> mi.Float64:
     """`count` numbers in [0, 1), one in each stratum: (i + jitter_i) / count."""
-    # a literal would compile new kernels for every count
-    return (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(jitter)) / dr.opaque(mi.Float64, count)
+    return (mi.Float64(dr.arange(mi.UInt32, count)) + mi.Float64(jitter)) / varying(mi.Float64, count)
 
 
 def sample_edge(dist: EdgeDistribution, u: mi.Float64) -> tuple[mi.UInt32, mi.Float]:

@@ -7,17 +7,16 @@ radiance gradients of the same scene go through.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
+from ..core.memory import Memory
+from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
 from .capabilities import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
 from .facts import SceneFacts, ShapeFacts
-
-SMALL_SCENE = 0.1
-"""Diagonal [scene units] below which the primary term loses more than 0.2 % (measured on a lit box)."""
+from .size import loss_by_offsets, overflow
 
 
 @dataclass(frozen=True)
@@ -33,10 +32,11 @@ class Finding:
         return issubclass(self.category, PsdrError)
 
 
-def require_supported(facts: SceneFacts) -> None:
+def require_supported(facts: SceneFacts, memory: Memory | None = None) -> None:
     """Raise if the derivative of this scene would be wrong, warn if a part of it is missing.
 
-    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter.
+    All errors go into one message, under the type of the first. The text of a warning names the shape or emitter;
+    `memory` remembers which parts have been said already.
     """
     found = list(findings(facts))
     errors = [finding for finding in found if finding.is_error]
@@ -44,7 +44,7 @@ def require_supported(facts: SceneFacts) -> None:
         text = "\n".join(f"- {error.message}" for error in errors) if len(errors) > 1 else errors[0].message
         raise errors[0].category(text if len(errors) == 1 else f"{len(errors)} obstacles:\n{text}")
     for finding in found:
-        warnings.warn(finding.message, finding.category, stacklevel=2)
+        warn_once(finding.message, finding.category, memory if finding.category is UnsupportedWarning else None)
 
 
 def findings(facts: SceneFacts) -> Iterator[Finding]:
@@ -182,11 +182,10 @@ def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_extent(facts: SceneFacts) -> Iterator[Finding]:
-    """Mitsuba keeps rays off surfaces by 1e-4 (1 + coordinates), and edges of that size blur."""
-    if facts.geometry_moves and 0 < facts.extent < SMALL_SCENE * max(1, facts.reach):
-        text = (f"the scene is only {facts.extent:.2g} units across, up to {facts.reach:.2g} from the origin: "
-                "Mitsuba's ray offsets swallow a part of the derivative (1 % at 0.03, 9 % at 0.003 units across); "
-                "scale the scene up, or move it to the origin")  # fmt: skip
+    """Single precision: what is too large overflows, what is small or far away loses a part to ray offsets."""
+    if text := overflow(facts):
+        yield Finding(SceneError, "", text)
+    elif facts.geometry_moves and (text := loss_by_offsets(facts)):
         yield Finding(UnsupportedWarning, "", text)
 
 

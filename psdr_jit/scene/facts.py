@@ -13,7 +13,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from ..errors import UnsupportedError
 from .capabilities import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
 from .graph import (
     SceneGraph,
@@ -27,6 +26,7 @@ from .graph import (
     sees_frame,
     weights_of_delta_lobes,
 )
+from .guard import require_derivatives
 
 
 @dataclass(frozen=True)
@@ -168,10 +168,7 @@ def analyse(
     suspended (`dr.suspend_grad`) are enabled. Costs milliseconds and one synchronisation, so it can be repeated
     whenever parameters change.
     """
-    if not dr.is_diff_v(mi.Float):
-        raise UnsupportedError(
-            f"variant '{mi.variant()}' does not track derivatives; use mi.set_variant('llvm_ad_rgb')"
-        )
+    require_derivatives()
     with dr.resume_grad():
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         graph = SceneGraph(scene, sensor, counts)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.compat import mesh_positions
 from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
+from .names import traverse
 from .params import parameter_value
 
 HARD_EDGE = 1e-3
@@ -37,7 +38,7 @@ class SceneGraph:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, counts: Callable[[object], bool]):
         """`counts(value)`: does this parameter value, whose gradients are enabled, count as such?"""
         self._counts = counts
-        params = mi.traverse(scene)
+        params = traverse(scene)
         self._nodes = list(params.hierarchy)  # keeps the nodes, and with them their ids, alive
         self._values: dict[int, dict[str, object]] = {}  # id(node) -> parameter -> value
         self._enabled: dict[str, int] = {}  # traversed name -> id(node)

@@ -12,7 +12,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.errors import OptionError, SceneError, SetupError
+from psdr_jit.errors import OptionError, PsdrError, SceneError, SetupError
+from psdr_jit.scene.guard import require_scene, require_variant
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -31,6 +32,8 @@ def use_variant(name: str) -> None:
         raise OptionError(f"this Mitsuba has no variant '{name}'; it has {', '.join(mi.variants())}")
     try:
         mi.set_variant(name)
+    except PsdrError:
+        raise           # says what to do
     except (ImportError, RuntimeError) as error:
         if (getattr(error, "name", None) or "").startswith("psdr_jit"):
             raise   # a module of ours is missing: a defect, not a matter of set-up
@@ -69,8 +72,10 @@ def _cause(error: Exception) -> str:
     """What Mitsuba says, without its source lines; what one of our plugins says, without Python's traceback."""
     own = re.findall(r"\b(?:Parameter|Option|Scene|Unsupported)Error: (.*)", str(error))
     text = own[-1] if own else " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", str(error)).split())
-    if 'Plugin "psdr_' in text and "_ad_" not in mi.variant():
-        return f"its integrator needs derivatives, which {mi.variant()} does not track; use {DEFAULT_VARIANT}"
+    if "include recursion depth" in text:
+        files = re.findall(r"Error while loading (.*?) \(line", text)
+        around = files[: files.index(files[0], 1) + 1] if files[0] in files[1:] else files
+        return f"its <include>s do not end ({' includes '.join(around)}); remove one of them"
     return text
 
 
@@ -99,8 +104,8 @@ def check_sensor(scene: Any, index: int) -> None:
 
 def find_sensor(scene: Any, sensor: Any) -> Any:
     """The sensor itself, or the one with this index; a typed error if there is none."""
-    if not isinstance(scene, mi.Scene):
-        raise SceneError(f"expected a Mitsuba scene, got {type(scene).__name__}: load one with mi.load_file")
+    require_scene(scene)
+    require_variant(sensor, "the sensor")
     if isinstance(sensor, mi.Sensor):
         return sensor
     count = len(scene.sensors())

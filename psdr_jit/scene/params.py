@@ -13,13 +13,14 @@ import mitsuba as mi
 
 from psdr_jit.core.compat import VERTEX_NORMALS, VERTEX_POSITIONS
 from psdr_jit.errors import ParameterError, SceneError
+from psdr_jit.scene.names import stable_name, traverse
 
 
 @dataclass(frozen=True)
 class ParamInfo:
     """One scene parameter. `reason` says why it is not differentiable, or what to know when it is."""
 
-    name: str
+    name: str                # the key in `psdr_jit.traverse(scene)`; Mitsuba's own where the object has an id
     kind: str                # geometry, material, texture, emitter, camera, film, medium or other
     type: str                # name of the value's type
     shape: tuple[int, ...]   # (4, 4) for transforms, () for plain Python numbers
@@ -38,10 +39,15 @@ def differentiable_params(scene: Any, params: Any = None) -> list[ParamInfo]:
 
 
 def find_param(scene: Any, name: str, params: Any = None) -> ParamInfo:
-    """The description of parameter `name`; raises `ParameterError` when unknown or not differentiable."""
+    """The description of parameter `name`; raises `ParameterError` when unknown or not differentiable.
+
+    `name`: any of those in `scene_names`. `params`: what `scene_names.traverse` returned for the scene, if at hand.
+    """
     params = _traversed(scene) if params is None else params
     if not isinstance(name, str):
         raise ParameterError(f"a parameter is given by its name, such as 'shape.to_world', got {name!r}")
+    if name not in params:
+        name = stable_name(scene, name)
     if name not in params:
         raise ParameterError(f"the scene has no parameter '{name}'{_suggestion(name, list(params.keys()))}")
     info = _describe(params, name)
@@ -58,11 +64,12 @@ def also_enabled(scene: Any, names: Sequence[str]) -> Iterator[None]:
         yield
         return
     params = _traversed(scene)
+    found = [find_param(scene, name, params).name for name in names]
     before = {}
-    for name in names:
-        before |= values_to_keep(params, find_param(scene, name, params).name)
+    for name in found:
+        before |= values_to_keep(params, name)
     try:
-        for name in names:
+        for name in found:
             _assign(params, name, _attached(before[name]))
         params.update()
         yield
@@ -102,7 +109,7 @@ def _traversed(scene: Any) -> Any:
     if not isinstance(scene, mi.Object):
         raise SceneError(f"expected a Mitsuba scene of variant '{mi.variant()}', got {type(scene).__name__}: "
                          "load one with mi.load_file")
-    return mi.traverse(scene)
+    return traverse(scene)
 
 
 def parameter_value(params: Any, name: str) -> Any:

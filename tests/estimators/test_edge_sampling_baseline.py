@@ -14,8 +14,8 @@ from benchmarks.baselines import edge_sampling
 from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import gain
-from psdr_jit.edges.table import distribution_of
 from psdr_jit.errors import UnsupportedError
+from psdr_jit.sampling.rows import WeightedRows
 
 BLOCKER = "blocker.vertex_positions"
 SPP = 512
@@ -84,8 +84,9 @@ def test_third_segment(llvm, monkeypatch):
 
     def more_of_what_moves(table):
         """Any density will do; this one takes fewer samples."""
-        rows = table.segments.rows
-        return distribution_of([dr.norm(rows.p1 - rows.p0) * dr.select(rows.moves, 10, 1)])
+        (kind,) = table.kinds
+        weights = dr.norm(kind.rows.p1 - kind.rows.p0) * dr.select(kind.moving(), 10, 1)
+        return WeightedRows().init("edge sampling", [weights])
 
     monkeypatch.setattr(edge_sampling, "scene_distribution", more_of_what_moves)
     motion = motion_of("constant_shadow", BLOCKER)

@@ -9,7 +9,7 @@ import pytest
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.edges import buried, table
+from psdr_jit.edges import buried, scene_table
 from psdr_jit.edges.curves import curve_set
 from psdr_jit.scene import io as scene_io
 
@@ -61,8 +61,8 @@ def test_edges_that_may_be_reached_are_kept(llvm):
 @pytest.mark.parametrize("body", BODIES)
 def test_what_is_left_out_is_zero(llvm, monkeypatch, body, form):
     """With the buried edges alone, whichever body moves, the boundary terms vanish exactly."""
-    monkeypatch.setattr(table, "buried", lambda *args: ~buried.buried(*args))
-    monkeypatch.setattr(table, "curve_set", lambda shapes: curve_set([]))
+    monkeypatch.setattr(scene_table, "buried", lambda *args: ~buried.buried(*args))
+    monkeypatch.setattr(scene_table, "curve_set", lambda shapes: curve_set([]))
     scene = scene_with(body)
     names = [BOX, "floor.vertex_positions" if body == "block" else "floor.to_world"]
     for name in names:

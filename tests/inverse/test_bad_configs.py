@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import OpenEXR
 import pytest
 from inverse_problems import BOX, box_and_lamp, problem_of, scene_of, target_of, write_config
 
@@ -12,6 +13,7 @@ from psdr_jit.cli import main
 from psdr_jit.derivative import images
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse import config
+from psdr_jit.inverse.targets import read_image
 
 
 def test_every_mistake_of_a_file_is_reported_at_once(llvm, tmp_path):
@@ -103,11 +105,32 @@ def test_targets(llvm, tmp_path):
 
 
 def test_target_files_are_read_as_linear_radiance(llvm, tmp_path):
-    from psdr_jit.inverse.targets import read_image
-
     image = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
     images.write_exr(tmp_path / "target.exr", {"image": image})
     assert np.allclose(np.array(read_image(tmp_path / "target.exr"))[..., :3], image)
+
+
+def test_grey_target_files(llvm, tmp_path):
+    """One channel, whatever its name, is grey; other files say what is missing and the way out."""
+    values = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
+    grey, colour = tmp_path / "grey.exr", tmp_path / "colour.exr"
+    images.write_exr(colour, {"image": values})
+    for name in ("Y", "V", "depth.Z"):
+        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {name: values[..., 0].copy()}) as file:
+            file.write(str(grey))
+        assert np.array_equal(read_image(grey), np.repeat(values[..., :1], 3, axis=-1))
+        assert np.array_equal(read_image(grey, channels=1), values[..., :1])
+    assert np.allclose(read_image(colour, channels=1)[..., 0], values @ [0.2126, 0.7152, 0.0722], atol=1e-6)
+    scene = scene_of()
+    found = psdr_jit.optimize(scene, box_and_lamp(), grey, iterations=1, spp=1)
+    assert found.status == "finished"
+    odd = {"A": values[..., 0].copy(), "Z": values[..., 1].copy()}
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, odd) as file:
+        file.write(str(grey))
+    with pytest.raises(OptionError, match="channels A, Z, but the sensor renders R, G, B: .*pixel_format"):
+        psdr_jit.optimize(scene, box_and_lamp(), grey)
+    with pytest.raises(OptionError, match="R, G, B, A"):
+        read_image(colour, channels=4)
 
 
 def test_variables(llvm):

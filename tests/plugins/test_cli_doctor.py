@@ -13,7 +13,7 @@ import pytest
 
 from psdr_jit.cli import doctor, main
 from psdr_jit.cli import test as test_command
-from psdr_jit.errors import ParameterError, SetupError
+from psdr_jit.errors import ParameterError, SetupError, StorageError
 from psdr_jit.setup import drjit_libraries, llvm, llvm_fetch
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,10 +67,42 @@ def test_traceback_on_request(monkeypatch, capsys) -> None:
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_defects_of_ours_are_not_hidden(monkeypatch) -> None:
-    install_command(monkeypatch, raiser(ModuleNotFoundError("x", name="psdr_jit.nonsense")))
-    with pytest.raises(ModuleNotFoundError):
-        main.main(["fake"])
+@pytest.mark.parametrize("error", [
+    ModuleNotFoundError("no module", name="psdr_jit.nonsense"), ZeroDivisionError("division by zero"), KeyError("name"),
+    RuntimeError("first line\nsecond line"), TypeError(), OSError(5, "Input/output error"),
+])  # fmt: skip
+def test_what_nobody_foresaw_is_one_line_and_its_traceback_on_request(error, monkeypatch, capsys) -> None:
+    """Status 1 is left to checks that did not pass."""
+    install_command(monkeypatch, raiser(error))
+    monkeypatch.delenv(main.TRACEBACK_VARIABLE, raising=False)
+    assert main.main(["fake"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert type(error).__name__ in line and f"{main.TRACEBACK_VARIABLE}=1 shows where" in line
+    monkeypatch.setenv(main.TRACEBACK_VARIABLE, "1")
+    assert main.main(["fake"]) == 3
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("cause", "status", "text"), [
+    (ParameterError("no such parameter"), 2, "psdr: error: no such parameter"),
+    (StorageError("no room"), 3, "psdr: error: no room"),
+    (RuntimeError("jit_malloc(): out of memory!"), 3, "fewer samples per pixel"),
+    (ValueError("the cause"), 3, "ValueError: the cause"),
+])  # fmt: skip
+def test_what_drjit_has_wrapped_is_found(cause, status, text, monkeypatch, capsys) -> None:
+    wrapped = RuntimeError("drjit.custom(): error while performing a custom differentiable operation. (see above).")
+    wrapped.__cause__ = cause
+    install_command(monkeypatch, raiser(wrapped))
+    assert main.main(["fake"]) == status
+    assert text in capsys.readouterr().err
+
+
+def test_output_that_cannot_be_printed() -> None:
+    code = "import sys; from psdr_jit.cli.main import main; sys.exit(main(['doctor']))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert done.returncode == 3
+    assert "No space left" in done.stderr and "Traceback" not in done.stderr and "Exception" not in done.stderr
 
 
 def test_wrong_usage(capsys) -> None:

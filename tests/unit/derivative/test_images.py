@@ -7,8 +7,9 @@ import os
 import numpy as np
 import pytest
 
+from psdr_jit.core import files
 from psdr_jit.derivative import images
-from psdr_jit.errors import OptionError
+from psdr_jit.errors import OptionError, StorageError
 
 
 @pytest.fixture
@@ -73,9 +74,11 @@ def test_failure_leaves_the_old_file_and_no_other(tmp_path):
     def fail(temporary):
         with open(temporary, "w") as file:
             file.write("half")
-        raise RuntimeError("out of space")
+        raise error
 
-    with pytest.raises(RuntimeError):
-        images._atomically(path, fail)
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["a.png"]
+    for error, expected in ((RuntimeError("a defect"), RuntimeError), (OSError(28, "No space left"), StorageError),
+                            (RuntimeError("Mitsuba: No space left on device"), StorageError)):  # fmt: skip
+        with pytest.raises(expected):
+            files.replace(path, fail)
+        assert path.read_text() == "old"
+        assert os.listdir(tmp_path) == ["a.png"]

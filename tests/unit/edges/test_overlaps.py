@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from psdr_jit.core.memory import Memory
 from psdr_jit.edges.overlaps import box_of, crossing, warn_about_pairs
 from psdr_jit.errors import UnsupportedWarning
 
@@ -45,7 +46,7 @@ def test_uncovered_pairs_are_named_once(llvm):
     T = mi.ScalarTransform4f
     found = shapes(tube=("cylinder", T()), floor=("rectangle", T().translate([0, 0, 0.5]).scale(3)),
                    box=("cube", T().translate([0, 0, 9])))  # fmt: skip
-    said = {}
+    said = Memory()
     with pytest.warns(UnsupportedWarning, match="'tube' .cylinder. and 'floor'") as caught:
         warn_about_pairs(found, pairs_of(found), said)
     assert len(caught) == 1
@@ -62,7 +63,7 @@ def test_two_balls(llvm, shift, count):
     found = shapes(a=("sphere", T()), b=("sphere", T().translate(list(direction))))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about_pairs(found, pairs_of(found), {})
+        warn_about_pairs(found, pairs_of(found), Memory())
     assert len(caught) == count
 
 
@@ -71,4 +72,4 @@ def test_covered_pairs_are_not_named(llvm):
     found = shapes(ball=("sphere", T()), floor=("rectangle", T().scale(3)), box=("cube", T().translate([0.3, 0, 0])))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_about_pairs(found, pairs_of(found), {})
+        warn_about_pairs(found, pairs_of(found), Memory())

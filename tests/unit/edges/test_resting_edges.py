@@ -8,7 +8,7 @@ import numpy as np
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
-from psdr_jit.edges.table import scene_edges
+from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
 
@@ -16,7 +16,7 @@ from psdr_jit.scene.params import also_enabled
 def edges_of(scene, integrator):
     with also_enabled(scene, ["camera.to_world"]):
         job = prepare(integrator.call(scene, scene.sensors()[0], 0, 4)).jobs[0][1]
-        return scene_edges(job).segments
+        return scene_edges(job).kinds[0]
 
 
 def test_they_are_kept_and_renewed(llvm):

@@ -142,6 +142,26 @@ def test_restore_brings_authored_normals_back(scene):
     assert np.array_equal(numbers(p.params["box.vertex_normals"]), before)
 
 
+@pytest.mark.parametrize("make", [
+    list, tuple, np.array, lambda v: np.array([v]), lambda v: mi.Vector3f(*v), lambda v: mi.ScalarVector3f(*v),
+    lambda v: mi.Point3f(*v), lambda v: mi.Normal3f(*v), lambda v: mi.TensorXf(v), lambda v: mi.Float(v),
+])  # fmt: skip
+@pytest.mark.parametrize("name, way", [("box.vertex_positions", "direction"), ("box.vertex_positions", "rotate"),
+                                       ("lamp.position", "direction"), ("panel.emitter.radiance.value", "direction")])
+def test_a_direction_may_be_any_kind_of_array(scene, name, way, make):
+    expected, found = (perturb(scene, name, **{way: v}) for v in ((1, 0, 2), make([1.0, 0.0, 2.0])))
+    assert found.label == expected.label and found.scale == expected.scale
+    ends = [numbers(p.curve(mi.Float(0.1))) for p in (expected, found)]
+    assert np.array_equal(*ends) and not np.array_equal(ends[0], numbers(found.curve(mi.Float(0))))
+
+
+def test_a_vector_per_vertex_keeps_its_order(scene):
+    """Dr.Jit stores all x first, the parameter x y z of one vertex after the other."""
+    flat = np.arange(72.0)
+    expected, found = (perturb(scene, "box.vertex_positions", v) for v in (flat, mi.Point3f(flat.reshape(24, 3).T)))
+    assert np.array_equal(*(numbers(p.curve(mi.Float(0.1))) for p in (expected, found)))
+
+
 @pytest.mark.parametrize("name, how, words", [
     ("box.vertex_positions", {}, "needs a direction"),
     ("box.vertex_positions", dict(direction=(1, 0)), "3 numbers"),

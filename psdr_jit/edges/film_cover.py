@@ -1,0 +1,75 @@
+"""How much of an edge a sensor can see: what the primary boundary's rows are drawn in proportion to.
+
+The prior length × exterior angle is the one a viewpoint-free table would use; for a given sensor the projected length
+is known, and edges that provably cannot contribute get weight 0: outside the film, on the far side of a closed shape,
+or between faces that look alike. Uses only what forward and backward mode both know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
+from .points import facing
+from .rows import EdgeRows
+
+#: Edges this far outside the film [px] may still matter: a lens point other than the centre sees them elsewhere.
+LENS_CENTRE = 0.5
+
+#: Least length that counts [px]: an edge seen end-on is still an edge.
+LEAST_LENGTH = 1e-3
+
+
+def lens_reach(frame: SensorFrame, depth: mi.Float) -> mi.Float:
+    """Largest displacement on the film [px] when the lens point moves from the centre to the rim, at a depth."""
+    if frame.kind != "thinlens":
+        return mi.Float(0)
+    px_per_unit = dr.rsqrt(mi.Float(frame.px_area)) / frame.focus
+    return frame.aperture * dr.abs(1 - frame.focus / depth) * px_per_unit
+
+
+def overlaps_film(frame: SensorFrame, a: mi.Point2f, b: mi.Point2f, margin: mi.Float, border: int) -> mi.Bool:
+    """Does the bounding box of two film positions [px] overlap the sampled window?"""
+    inside = mi.Bool(True)
+    for axis in range(2):
+        lower = frame.crop_offset[axis] - border
+        upper = frame.crop_offset[axis] + frame.crop_size[axis] + border
+        inside &= (dr.maximum(a[axis], b[axis]) >= lower - margin) & (dr.minimum(a[axis], b[axis]) <= upper + margin)
+    return inside
+
+
+@dataclass
+class EdgeOnFilm:
+    """Which way the faces of an edge turn, by row; conservative for every point of a lens."""
+
+    may_be_outline: mi.Bool
+    behind0: mi.Bool  # hidden by the closed surface that face 0 belongs to
+    behind1: mi.Bool
+
+    @staticmethod
+    def of(rows: EdgeRows, frame: SensorFrame) -> EdgeOnFilm:
+        view = towards_viewer(viewpoint(frame, mi.Point2f(LENS_CENTRE)), rows.p0)
+        s0, s1 = facing(rows.n0, view), facing(rows.n1, view)
+        slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
+        outline = (s0 * s1 <= 0) | (dr.minimum(dr.abs(s0), dr.abs(s1)) <= slack)
+        hidden = ((shell != 0) & (s * shell <= -slack) for s, shell in ((s0, rows.shell0), (s1, rows.shell1)))
+        return EdgeOnFilm(outline, *hidden)
+
+
+def straight_cover(
+    rows: EdgeRows, frame: SensorFrame, border: int, relevance: mi.Float, hidden: mi.Bool
+) -> mi.Float:
+    """Relative sampling weight of straight edges [px]: their projected length, times `relevance`; detached."""
+    centre = mi.Point2f(LENS_CENTRE)
+    a, b = look_at(frame, rows.p0, centre), look_at(frame, rows.p1, centre)
+    z0, z1 = (frame.to_local @ rows.p0).z, (frame.to_local @ rows.p1).z
+    in_front = (dr.minimum(z0, z1) > frame.near) & (dr.minimum(z0, z1) < frame.far)
+    behind = dr.maximum(z0, z1) <= frame.near
+    reach = dr.maximum(lens_reach(frame, z0), lens_reach(frame, z1))
+    film = dr.norm(mi.Vector2f(frame.crop_size))
+    length = dr.clip(dr.norm(b.p - a.p), LEAST_LENGTH, film)
+    length = dr.select(in_front, dr.select(overlaps_film(frame, a.p, b.p, reach, border), length, 0), film)
+    return dr.select(hidden | behind, 0, relevance * length)

@@ -1,0 +1,167 @@
+"""What every kind of edge can be asked: the contract behind which meshes, outlines and intersections are alike.
+
+A kind is one family of discontinuities, with rows of its own in the edge table. The estimators know the table only; the
+table asks each kind about its own rows. Two sorts differ in how a line through one of their points is drawn:
+
+    FixedKind      a curve in space, the same from everywhere: draw the point first, then a direction
+    ContourKind    an outline, elsewhere for every viewpoint: draw the direction, or the viewpoint, first
+
+A new kind is a file with a subclass of one of them, and an entry in `table.edge_table`. Everything is detached but for
+`displacement`. `row` counts the kind's own rows; lanes that are not `active` may hold any row and are ignored.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import Enum
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sensor_frame import SensorFrame
+from .lights import LightBounds
+from .location import EdgeLocation
+from .wedges import Wedges
+
+
+class Use(Enum):
+    """What a line through an edge is drawn for: decides in which directions an edge can matter."""
+
+    STEP = "step"  # radiance differs across it: outlines and visible creases, borders, seams
+    BACKGROUND = "background"  # what lies behind it appears or disappears: outlines
+    SHADOW = "shadow"  # light passes on one side only: outlines
+
+
+@dataclass
+class OnEdge:
+    """A point of an edge; detached, one entry per sample."""
+
+    x: mi.Point3f  # [m]
+    dx: mi.Vector3f  # derivative of x by the row's parameter t [m]
+    outward: mi.Vector3f  # of a contour: leads off the surface, across the edge; 0 where neither side is special
+    local: mi.Point3f  # of a contour: the material point, in object space
+    scale: mi.Float  # of a contour: size of its shape [m]; 0 on fixed edges
+    offset: mi.Float  # step to the side at which a ray passes the edge [m]
+    lead: mi.Float  # step along a line that clears what the edge belongs to, or rests on [m]
+    aside: mi.Float  # step to the side that a line through the point itself needs: 0 unless it is tangent to a surface
+    valid: mi.Bool
+
+    def across(self, ω: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+        """Seen along ω: `(n_perp, across)`, the unit vector across the edge, away from the surface of a contour, and
+        the length of edge that is seen per unit of its parameter, |dx/dt × ω| [m].
+        """
+        side = dr.cross(self.dx, ω)
+        length = dr.norm(side)
+        side = dr.select(length > 0, side / length, 0)
+        return side * dr.select(dr.dot(self.outward, side) >= 0, 1.0, -1.0), length
+
+
+@dataclass
+class Sight:
+    """An edge point and the line along which it is looked at; detached, one entry per sample."""
+
+    at: EdgeLocation
+    ω: mi.Vector3f  # unit, from the viewer to the edge point
+    r: mi.Float  # how far away the viewer is [m]
+    n_perp: mi.Vector3f  # unit, perpendicular to ω and to the edge
+    offset: mi.Float  # as of `OnEdge`
+    lead: mi.Float
+
+    @staticmethod
+    def of(on: OnEdge, row: mi.UInt32, t: mi.Float, ω: mi.Vector3f, r: mi.Float, n_perp: mi.Vector3f) -> Sight:
+        """The point `on` of `row` of the table, looked at from the distance `r`."""
+        return Sight(EdgeLocation(row, t, on.x, on.local, on.scale), ω, r, n_perp, on.offset, on.lead)
+
+    @property
+    def viewer(self) -> mi.Point3f:
+        return self.at.x - self.r * self.ω
+
+    def beside(self, which: mi.UInt32) -> mi.Ray3f:
+        """The ray that passes the edge on side `which`: 0 towards −n_perp, 1 towards +n_perp."""
+        towards = dr.select(which == 0, -1.0, 1.0)
+        return mi.Ray3f(self.at.x + towards * self.offset * self.n_perp - self.lead * self.ω, self.ω)
+
+
+@dataclass
+class Side:
+    """What lies on one side of an edge: a face of its own, or whatever a ray meets."""
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    traced: mi.Bool  # `pi` is still to be found by tracing `ray`
+    own: mi.Bool  # a surface that moves as the edge does: relative to it, the edge rests
+    differs: mi.Bool  # the two sides may differ at all
+
+    @staticmethod
+    def found_by(ray: mi.Ray3f, own: mi.Bool | bool = False) -> Side:
+        """To be found by tracing `ray`."""
+        none = dr.zeros(mi.PreliminaryIntersection3f)
+        return Side(ray, none, mi.Bool(True), mi.Bool(own), mi.Bool(True))
+
+
+class EdgeKind(ABC):
+    """One family of discontinuities."""
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of rows."""
+
+    @abstractmethod
+    def moving(self) -> mi.Bool:
+        """By row: can it move?"""
+
+    @abstractmethod
+    def places(self) -> mi.Point3f:
+        """By row: roughly where it is [m]."""
+
+    @abstractmethod
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        """By row: how much of it the sensor can see, as a length on the film [px]; 0 only if certainly nothing."""
+
+    @abstractmethod
+    def line_weights(self, use: Use) -> mi.Float:
+        """By row: length × measure of the directions in which it matters [m rad]; 0 only if there are none."""
+
+    @abstractmethod
+    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
+        """By row: may one of `lights` see it as an outline, with something of the scene (`box`) behind it?"""
+
+    @abstractmethod
+    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
+        """The point at t ∈ [0, 1) of `row` for a viewpoint: homogeneous, (x, y, z, 1) or (−direction, 0)."""
+
+    @abstractmethod
+    def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
+        """What lies on side `which` of the edge: 0 towards −n_perp, 1 towards +n_perp."""
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """Where a ray is aimed that asks whether the viewer sees the edge: the point, or a little off it."""
+        return sight.at.x
+
+    @abstractmethod
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+        """Vector of value 0 whose derivative is the velocity of the edge there, attached. Its part along the edge is
+        arbitrary.
+        """
+
+
+class FixedKind(EdgeKind):
+    """A curve in space."""
+
+    @abstractmethod
+    def wedges(self, row: mi.UInt32, use: Use, active: mi.Bool) -> Wedges:
+        """The directions in which it matters, with their relative densities."""
+
+    @abstractmethod
+    def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
+        """Where light along ω passes: `(n_perp to the open side, across, whether it is an outline for ω)`."""
+
+
+class ContourKind(EdgeKind):
+    """An outline of a curved surface."""
+
+    @abstractmethod
+    def inside(self, row: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        """A point inside the surface: what a light is asked to shine at before the outline is known."""

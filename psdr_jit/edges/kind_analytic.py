@@ -1,0 +1,108 @@
+"""Outlines and rims of disks, cylinders and spheres, which have no triangles (`curves`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sensor_frame import SensorFrame, look_at, viewpoint
+from .curves import (
+    PIECES,
+    CurveRows,
+    CurveSet,
+    attached_to_world,
+    curve_centre,
+    curve_lengths,
+    curve_point,
+    curve_scale,
+    local_viewpoint,
+    transform_point,
+    transform_vector,
+)
+from .film_cover import LEAST_LENGTH, LENS_CENTRE, lens_reach, overlaps_film
+from .kind import ContourKind, OnEdge, Side, Sight, Use
+from .lights import LightBounds
+from .location import EdgeLocation
+from .points import CURVE_LEAD, VISIBILITY_EPSILON, clearance
+
+
+@dataclass(frozen=True)
+class AnalyticCurves(ContourKind):
+    """Pieces of curves, in proportion to which they are sampled."""
+
+    curves: CurveSet
+    moves: mi.Bool  # by row: can its shape move?
+    centre: mi.Point3f  # of the scene
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.curves.rows.kind)
+
+    def moving(self) -> mi.Bool:
+        return self.moves
+
+    def places(self) -> mi.Point3f:
+        return mi.Point3f(dr.detach(attached_to_world(self.curves.shapes, self.curves.rows.shape)[3]))
+
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        row = dr.arange(mi.UInt32, self.count)
+        lens = mi.Point2f(LENS_CENTRE)
+        eye = viewpoint(frame, lens)
+        on = [self.on(row, mi.Float(t), eye, mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
+        a, middle, b = (look_at(frame, point.x, lens) for point in on)
+        valid = a.valid | middle.valid | b.valid
+        # A piece is an arc, not its chord: leave room for the sagitta.
+        chord = dr.norm(b.p - middle.p) + dr.norm(middle.p - a.p)
+        margin = chord + 1 + lens_reach(frame, (frame.to_local @ on[1].x).z)
+        film = dr.norm(mi.Vector2f(frame.crop_size))
+        length = dr.clip(chord, LEAST_LENGTH, film)
+        whole = a.valid & middle.valid & b.valid
+        overlaps = overlaps_film(frame, a.p, b.p, margin, border)
+        return dr.select(valid, dr.select(~whole | overlaps, length, 0), 0)
+
+    def line_weights(self, use: Use) -> mi.Float:
+        return curve_lengths(self.curves) * dr.pi
+
+    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
+        return dr.full(mi.Bool, True, self.count)
+
+    def _columns(self, row: mi.UInt32, active: mi.Bool) -> tuple[CurveRows, tuple[mi.Vector3f, ...]]:
+        """The rows, and the columns of their shapes' object-to-world maps, detached."""
+        rows = dr.gather(CurveRows, self.curves.rows, row, active)
+        return rows, tuple(dr.detach(c) for c in attached_to_world(self.curves.shapes, rows.shape))
+
+    def inside(self, row: mi.UInt32, active: mi.Bool) -> mi.Point3f:
+        rows, columns = self._columns(row, active)
+        return transform_point(columns, curve_centre(rows.kind))
+
+    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
+        rows, columns = self._columns(row, active)
+        point = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, view))
+        x, scale = transform_point(columns, point.x), curve_scale(columns, point)
+        offset, _ = clearance(x, scale, self.centre)
+        return OnEdge(
+            x=x,
+            dx=transform_vector(columns, point.dx_ds) / PIECES,
+            outward=transform_vector(columns, point.outward),
+            local=point.x,
+            scale=scale,
+            offset=offset,
+            lead=CURVE_LEAD * scale,
+            aside=offset,
+            valid=active & point.valid,
+        )
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """A ray aimed at a tangent point meets the shape itself: beside it."""
+        return sight.at.x + VISIBILITY_EPSILON * sight.at.scale * sight.n_perp
+
+    def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
+        return Side.found_by(sight.beside(which), own=which == 0)
+
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+        """That of the material point: a contour moves with n·v of the surface."""
+        shape = dr.gather(mi.UInt32, self.curves.rows.shape, row, active)
+        x = transform_point(attached_to_world(self.curves.shapes, shape), dr.detach(at.local))
+        return mi.Vector3f(x - dr.detach(x))

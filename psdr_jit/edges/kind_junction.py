@@ -1,0 +1,73 @@
+"""Curves along which two surfaces cut into each other, with a motion of their own (`junctions`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sensor_frame import SensorFrame
+from .film_cover import EdgeOnFilm, straight_cover
+from .junction_points import bend, junction_motion
+from .junctions import JunctionRows
+from .kind import FixedKind, OnEdge, Side, Sight, Use
+from .kind_mesh import on_fixed, straight_point
+from .lights import LightBounds
+from .location import EdgeLocation
+from .rows import EdgeRows
+from .wedges import Wedges, meeting_wedges
+
+
+@dataclass(frozen=True)
+class Junctions(FixedKind):
+    """Segments between triangles, and arcs between a ball and triangles, as edges between both surfaces."""
+
+    rows: EdgeRows
+    index: mi.UInt32  # by row: entry of `curves`
+    curves: JunctionRows
+    centre: mi.Point3f  # of the scene
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.index)
+
+    def moving(self) -> mi.Bool:
+        return self.rows.moves
+
+    def places(self) -> mi.Point3f:
+        return (self.rows.p0 + self.rows.p1) / 2
+
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        """Being behind one of the surfaces is enough to be hidden."""
+        seen = EdgeOnFilm.of(self.rows, frame)
+        return straight_cover(self.rows, frame, border, mi.Float(1), seen.behind0 | seen.behind1)
+
+    def line_weights(self, use: Use) -> mi.Float:
+        """Both surfaces block the light: nothing passes such a curve, so it casts no shadow."""
+        if use is Use.SHADOW:
+            return dr.zeros(mi.Float, self.count)
+        return dr.norm(self.rows.p1 - self.rows.p0) * meeting_wedges(self.rows).measure
+
+    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
+        return dr.full(mi.Bool, False, self.count)
+
+    def wedges(self, row: mi.UInt32, use: Use, active: mi.Bool) -> Wedges:
+        return meeting_wedges(dr.gather(EdgeRows, self.rows, row, active))
+
+    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
+        index = dr.gather(mi.UInt32, self.index, row, active)
+        x, dx = bend(self.curves, index, *straight_point(self.rows, row, t, active), active)
+        return on_fixed(x, dx, self.centre, dr.gather(mi.Float, self.rows.blur, row, active), active)
+
+    def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
+        side = dr.cross(dx, ω)
+        across = dr.norm(side)
+        return dr.select(across > 0, side / across, 0), across, mi.Bool(False)
+
+    def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
+        return Side.found_by(sight.beside(which))
+
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+        index = dr.gather(mi.UInt32, self.index, row, active)
+        return dr.select(active, junction_motion(self.curves, index, at.t, dr.detach(at.x), active), 0)

@@ -1,0 +1,165 @@
+"""Edges of triangle meshes: outlines, creases, borders and seams, straight and fixed in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sensor_frame import SensorFrame
+from .film_cover import EdgeOnFilm, straight_cover
+from .kind import FixedKind, OnEdge, Side, Sight, Use
+from .lights import LightBounds, may_cast_shadow
+from .location import EdgeLocation
+from .points import INSET, clearance, face_sides
+from .rows import EdgeRows, apex_uv, face_uv
+from .segments import attached_positions
+from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
+
+
+def straight_point(rows: EdgeRows, row: mi.UInt32, t: mi.Float, active) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Point at parameter `t` of straight rows, and its derivative by `t`."""
+    p0 = dr.gather(mi.Point3f, rows.p0, row, active)
+    dx = mi.Vector3f(dr.gather(mi.Point3f, rows.p1, row, active) - p0)
+    return mi.Point3f(p0 + t * dx), dx
+
+
+def on_fixed(x: mi.Point3f, dx: mi.Vector3f, centre: mi.Point3f, blur: mi.Float, active: mi.Bool) -> OnEdge:
+    """A point of an edge whose place does not depend on the viewpoint."""
+    offset, lead = clearance(x, dr.norm(dx), centre, blur)
+    return OnEdge(
+        x, dx, mi.Vector3f(0), mi.Point3f(0), mi.Float(0), offset=offset, lead=lead, aside=mi.Float(0), valid=active
+    )
+
+
+@dataclass(frozen=True)
+class MeshEdges(FixedKind):
+    """Rows of the edge set; `normals`: shading normals by vertex, None if all meshes are flat-shaded."""
+
+    meshes: tuple[mi.Mesh, ...]
+    rows: EdgeRows
+    shapes: mi.ShapePtr  # by EdgeRows.shape0 and shape1
+    normals: mi.Normal3f | None
+    centre: mi.Point3f  # of the scene
+
+    @property
+    def count(self) -> int:
+        return dr.width(self.rows.v0)
+
+    def moving(self) -> mi.Bool:
+        return self.rows.moves
+
+    def places(self) -> mi.Point3f:
+        return (self.rows.p0 + self.rows.p1) / 2
+
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        seen = EdgeOnFilm.of(self.rows, frame)
+        anywhere = self.rows.traced | self.rows.border
+        relevance = dr.select(anywhere | seen.may_be_outline, 1, crease_relevance(self.rows))
+        return straight_cover(self.rows, frame, border, relevance, seen.behind0 & seen.behind1)
+
+    def line_weights(self, use: Use) -> mi.Float:
+        return dr.norm(self.rows.p1 - self.rows.p0) * _wedges(self.rows, use).measure
+
+    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
+        return may_cast_shadow(self.rows, lights, box)
+
+    def wedges(self, row: mi.UInt32, use: Use, active: mi.Bool) -> Wedges:
+        return _wedges(dr.gather(EdgeRows, self.rows, row, active), use)
+
+    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
+        x, dx = straight_point(self.rows, row, t, active)
+        return on_fixed(x, dx, self.centre, dr.gather(mi.Float, self.rows.blur, row, active), active)
+
+    def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
+        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        border = dr.gather(mi.Bool, self.rows.border, row, active)
+        side = dr.cross(dx, ω)
+        across = dr.norm(side)
+        side = dr.select(across > 0, side / across, 0)
+        # Two edges of a face in line with the light cast one shadow: the one whose other face is lit counts.
+        a0, a1 = face_sides(n0, n1, ω)
+        silhouette = (across > 0) & dr.select(border, a0 != 0, (a0 < 0) != (a1 > 0))
+        where_faces_are = a0 + dr.select(border, 0, a1)
+        return side * dr.select(where_faces_are > 0, -1.0, 1.0), across, silhouette
+
+    def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
+        """Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than
+        any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp) (`face_sides`); two faces
+        on the same side are a silhouette, of which the one nearer to the viewer is seen. A face seen edge-on is on
+        neither side: the other face, if there is one, then ends at a silhouette.
+        """
+        rows = dr.gather(EdgeRows, self.rows, row, active)
+        τ = dr.normalize(rows.p1 - rows.p0)
+        into0, into1 = dr.cross(rows.n0, τ), dr.cross(τ, rows.n1)
+        a0, a1 = face_sides(rows.n0, rows.n1, sight.ω)
+        in_view = (a0 != 0) | (a1 != 0)
+        silhouette = ~rows.border & (a0 * a1 >= 0)
+        nearer1 = silhouette & (dr.dot(into1, sight.ω) * dr.abs(a0) < dr.dot(into0, sight.ω) * dr.abs(a1))
+
+        towards = dr.select(which == 0, -1.0, 1.0)
+        on0, on1 = a0 * towards > 0, ~rows.border & (a1 * towards > 0)
+        use1 = on1 & (~on0 | nearer1)
+        face = (on0 | on1) & ~rows.traced
+        pi = self._face(rows, use1, sight, face & active)
+        beside = sight.beside(which)
+        ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
+        # Borders of two shapes at one place, of which one moves: their faces move against each other.
+        own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
+        return Side(ray, pi, ~face, own, in_view & (rows.border | silhouette | rows.seam) | rows.traced)
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """Onto the other face where one of two is seen edge-on; the point itself at all other edges.
+
+        A line of sight to such an edge runs along the face, and whether it meets what ends with it is rounding.
+        """
+        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        border = dr.gather(mi.Bool, self.rows.border, row, active)
+        a0, a1 = face_sides(n0, n1, sight.ω)
+        one = ~border & ((a0 == 0) ^ (a1 == 0))
+        return sight.at.x + dr.select(one, dr.sign(a0 + a1) * sight.offset, 0) * sight.n_perp
+
+    def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """A point of face 0 or 1 next to the edge, as if the viewer had looked at it."""
+        corners = dr.select(use1, rows.corner1, rows.corner0)
+        uv = face_uv(corners, sight.at.t)
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = active
+        pi.t = dr.select(pi.valid, sight.r, dr.inf)
+        pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
+        pi.shape = dr.gather(mi.ShapePtr, self.shapes, dr.select(use1, rows.shape1, rows.shape0), active)
+        fringe = self._fringe(rows, use1, sight.at.t, -sight.ω, active)
+        apex = apex_uv(corners)
+        uv += fringe * (apex - uv)
+        # Beyond a fringe only the apex is sure to be lit: the way to the centroid may lead back into the dark.
+        pi.prim_uv = uv + INSET * (dr.select(fringe > 0, apex, mi.Point2f(1 / 3)) - uv)
+        return pi
+
+    def _fringe(self, rows: EdgeRows, use1: mi.Bool, t: mi.Float, viewer: mi.Vector3f, active) -> mi.Float:
+        """Share of the way from an edge to the opposite corner at which the shading normal begins to face the viewer.
+
+        Along an outline, interpolated normals turn away from the viewer before the surface does, and a BSDF is black
+        there. The step at the inner end of this fringe, as thin as the mesh is fine, is counted with the outline.
+        """
+        if self.normals is None:
+            return mi.Float(0)
+        active &= rows.smooth
+        apex = dr.select(use1, rows.apex1, rows.apex0)
+        viewer *= dr.sign(dr.dot(dr.select(use1, rows.n1, rows.n0), viewer))  # the back of an open surface
+        at0, at1, at_apex = (
+            dr.dot(dr.gather(mi.Normal3f, self.normals, v, active), viewer) for v in (rows.v0, rows.v1, apex)
+        )
+        at_edge = (1 - t) * at0 + t * at1
+        return dr.select(active & (at_edge < 0) & (at_apex > 0), at_edge / (at_edge - at_apex), 0)
+
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+        positions = attached_positions(self.meshes)
+        v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (self.rows.v0, self.rows.v1))
+        x0, x1 = (dr.gather(mi.Point3f, positions, v, active) for v in (v0, v1))
+        x = (1 - at.t) * x0 + at.t * x1
+        return mi.Vector3f(x - dr.detach(x))
+
+
+def _wedges(rows: EdgeRows, use: Use) -> Wedges:
+    return step_wedges(rows) if use is Use.STEP else silhouette_wedges(rows)

@@ -1,0 +1,149 @@
+"""The edge table of a scene: which shapes give which kinds of edges, and what of them is left out at once.
+
+A new kind of edge enters here, in `edge_table`.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import mesh_buffers
+from ..core.memory import Slot
+from ..core.sensor_frame import origin_box
+from ..core.upload import uploaded
+from ..core.varying import varying
+from ..plan.job import Job
+from ..scene.facts import ShapeFacts
+from ..scene.tangent_facts import vertex_speeds
+from .buried import buried
+from .curves import CURVES_OF, PIECES, curve_set
+from .junctions import Ball
+from .kind import EdgeKind
+from .kind_analytic import AnalyticCurves
+from .kind_junction import Junctions
+from .kind_mesh import MeshEdges
+from .overlaps import apart, box_of, crossing, warn_about_pairs
+from .rows import EdgeRows
+from .segments import EdgeSet, edge_set
+from .table import EdgeTable
+
+#: Of one render call: the table.
+TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
+
+#: Of an integrator: the arrays that straight edges were made from while every shape rests, and these edges.
+RESTING: Slot[tuple[list, EdgeSet] | None] = Slot(lambda: None)
+
+
+def scene_edges(job: Job) -> EdgeTable:
+    """Edges of all shapes, built once per render call; mesh topologies outlive it."""
+    if job.shared[TABLE] is None:
+        job.shared[TABLE] = edge_table(job)
+    return job.shared[TABLE]
+
+
+def edge_table(job: Job) -> EdgeTable:
+    """All edges of the scene, those that no path can reach left out."""
+    shapes = job.scene.shapes()
+    chosen = [s for s in job.facts.shapes if s.index >= 0]
+    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
+    pairs = crossing([box_of(shapes[s.index]) for s in chosen])
+    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
+    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
+    centre = varying(mi.Point3f, list(job.scene.bbox().center()))
+    balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
+    kinds, hidden = _between_faces(job, _edge_set(job, meshes, balls), meshes, overlapping, centre)
+    curves = _analytic(job, analytic, centre)
+    return EdgeTable(tuple(kinds) + (() if curves is None else (curves,)), hidden)
+
+
+def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
+    """Edges of the meshes; kept from call to call while every shape rests."""
+    shapes = [job.scene.shapes()[s.index] for s in meshes]
+    if job.facts.shapes_move or balls or not job.plan.prunes:
+        return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls)
+    buffers = [buffer for shape in shapes for buffer in mesh_buffers(shape)]
+    known = job.call.memory[RESTING]
+    # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
+    same = known is not None and [b.index for b in known[0]] == [b.index for b in buffers]
+    if not same:
+        known = (buffers, edge_set(shapes, [False] * len(shapes), job.call.memory))
+        job.call.memory[RESTING] = known
+    return replace(known[1], meshes=tuple(shapes))
+
+
+def _between_faces(
+    job: Job, found: EdgeSet, meshes: list[ShapeFacts], bodies: list[ShapeFacts], centre: mi.Point3f
+) -> tuple[list[EdgeKind], int]:
+    """Edges of meshes and junctions as kinds, and how many of them lie inside of other `bodies`."""
+    if found.rows is None:
+        return [], 0
+    outside = _seen_from_outside(job, meshes)
+    rows, _, hidden = _reachable(job, found.rows, bodies)
+    kinds: list[EdgeKind] = []
+    if rows is not None:
+        # not in place: the arrays may be those that are kept
+        rows = _as_seen(rows, outside)
+        if job.options.direction == "known" and job.plan.prunes:
+            speed = vertex_speeds(found.meshes)
+            rows.moves = rows.moves & (sum(dr.gather(mi.Float, speed, v) for v in (rows.v0, rows.v1)) > 0)
+        kinds.append(MeshEdges(found.meshes, rows, found.shapes, found.normals, centre))
+    if found.junctions is not None:
+        rows, index, count = _reachable(job, found.junctions.edges, bodies)
+        hidden += count
+        if rows is not None:
+            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre))
+    dr.eval([kind.rows for kind in kinds])  # now, not with the term that needs them first: its kernels would differ
+    return kinds, hidden
+
+
+def _as_seen(rows: EdgeRows, outside: mi.Float) -> EdgeRows:
+    """The rows, with shells that only count where paths meet the outer side alone."""
+    rows = copy(rows)
+    rows.shell0 = rows.shell0 * dr.gather(mi.Float, outside, rows.shape0)
+    rows.shell1 = rows.shell1 * dr.gather(mi.Float, outside, rows.shape1)
+    return rows
+
+
+def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
+    """1 for every mesh of which light paths from the sensor meet the outer side only, if it is closed; else 0.
+
+    Paths do not enter a closed opaque shape; they may start in it.
+    """
+    lower, upper = origin_box(job.frame)
+    flags = []
+    for facts in meshes:
+        flags.append(float(facts.opaque and apart(lower, upper, job.scene.shapes()[facts.index].bbox())))
+    return mi.Float(flags)
+
+
+def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[EdgeRows | None, mi.UInt32, int]:
+    """Edges that a path may reach, their rows, and how many others there are; None if there are only others."""
+    total = dr.width(rows.v0)
+    everything = dr.arange(mi.UInt32, total)
+    # while a function is being frozen, values cannot be read: nothing is left out
+    if not job.plan.prunes or dr.flag(dr.JitFlag.FreezingScope):
+        return rows, everything, 0
+    hidden = buried(job, rows, bodies)
+    count = 0 if hidden is None else int(dr.count(hidden)[0])
+    if count == 0:
+        return rows, everything, 0
+    if count == total:
+        return None, everything, count
+    dr.eval(rows, hidden)
+    kept = dr.compress(~hidden)
+    return dr.gather(EdgeRows, rows, kept), kept, count
+
+
+def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:
+    """Outlines and rims of the shapes without triangles."""
+    shapes = job.scene.shapes()
+    curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
+    if curves.rows is None:
+        return None
+    moves = np.concatenate([np.full(len(CURVES_OF[s.plugin]) * PIECES, s.moves) for s in analytic])
+    return AnalyticCurves(curves, uploaded(mi.Bool, moves), centre)

@@ -1,0 +1,64 @@
+"""Which row of the edge table, and where along it: a sampler that can be swapped.
+
+An integrator draws the rows of its boundary terms with `memory[ROW_SAMPLER]`. The default draws them in proportion to
+their weights. Another one, a guide, may use what earlier calls have learned, under the conditions that keep estimates
+unbiased: `init` fixes a state for the whole call, forward and backward mode get the same one, and `pdf` is positive
+wherever a weight is.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.memory import Slot
+from ..plan.job import Job
+from .distribution import EdgeDistribution, edge_distribution, pmf, sample_edge
+
+
+class RowSampler(ABC):
+    """Draws `(row, t)` for one term. States are plain data; what is learned lives in the sampler."""
+
+    @abstractmethod
+    def init(self, term: str, weights: list[mi.Float]) -> Any | None:
+        """The state for one call of `term`: `weights`, by kind of edge, of the rows. None if nothing can contribute."""
+
+    @abstractmethod
+    def sample(self, state: Any, u: mi.Float64) -> tuple[mi.UInt32, mi.Float]:
+        """`(row, t)` from u ∈ [0, 1), t ∈ [0, 1); monotonous in u, so that stratification carries over."""
+
+    @abstractmethod
+    def pdf(self, state: Any, row: mi.UInt32, t: mi.Float) -> mi.Float:
+        """Density of `sample`: probability of the row, times density of t."""
+
+    def learn(self, state: Any, row: mi.UInt32, t: mi.Float, value: mi.Spectrum) -> None:
+        """What samples of this call were worth, for later calls."""
+
+
+class WeightedRows(RowSampler):
+    """Rows in proportion to their weights, t uniform. Learns nothing."""
+
+    def init(self, term: str, weights: list[mi.Float]) -> EdgeDistribution | None:
+        if not weights:
+            return None
+        distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
+        return distribution if float(distribution.total[0]) > 0 else None
+
+    def sample(self, state: EdgeDistribution, u: mi.Float64) -> tuple[mi.UInt32, mi.Float]:
+        return sample_edge(state, u)
+
+    def pdf(self, state: EdgeDistribution, row: mi.UInt32, t: mi.Float) -> mi.Float:
+        return pmf(state, row)
+
+
+#: Of an integrator.
+ROW_SAMPLER: Slot[RowSampler] = Slot(WeightedRows)
+
+
+def edge_samples(job: Job, paths: int) -> int:
+    """Number of edge samples for a term's budget, which counts paths: one edge sample takes `paths` of them."""
+    width, height = job.frame.crop_size
+    return max(1, job.spp * width * height // paths)

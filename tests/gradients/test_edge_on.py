@@ -1,0 +1,119 @@
+"""Faces exactly in line with the viewer or the light: rounding must not decide which of their edges is the outline.
+
+Under parallel projection two edges of such a face cover each other, before and after the box has moved.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import assert_grad_close, fd, forward
+
+from benchmarks import meshes
+from psdr_jit.derivative.perturbation import perturb
+
+SPEC = {"type": "psdr_path", "max_depth": 2}
+DIRECTION = (1, 0.3, 0.7)
+STEP = 0.01  # of finite differences: less than a tenth of a pixel
+FURTHER = 1e-4  # past the position at which a face is in line: far beyond rounding, not to be seen in an image
+CENTRE, HALF = np.array([0.03, 0.02, 0]), np.array([0.5, 0.4, 0.6])  # of the box
+RIGHT, LEFT = CENTRE[0] + HALF[0], CENTRE[0] - HALF[0]
+
+
+def T():
+    return mi.ScalarTransform4f()
+
+
+def film() -> dict:
+    return {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
+
+
+def orthographic(axis, angle) -> dict:
+    """Along an axis, up to the rounding of sine and cosine."""
+    return {"type": "orthographic", "to_world": T().rotate(axis, angle).translate([0, 0, -4]), "film": film()}
+
+
+def perspective(origin, target) -> dict:
+    pose = T().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
+    return {"type": "perspective", "fov": 30, "to_world": pose, "film": film()}
+
+
+def scene_of(camera: dict, shift: float = 0.0, **objects) -> mi.Scene:
+    """The box, moved along x by `shift`; by default under two lamps that light all but its lower and far side."""
+    pose = T().translate(list(CENTRE + [shift, 0, 0])).scale(list(HALF))
+    objects.setdefault("box", {"type": "cube", "to_world": pose, "bsdf": {"type": "diffuse"}})
+    if "lamp" not in objects:
+        objects["lamp"] = {"type": "point", "position": [-3, 2, 4], "intensity": 30.0}
+        objects["fill"] = {"type": "point", "position": [4, 3, 1], "intensity": 15.0}
+    return mi.load_dict({"type": "scene", "camera": camera, **objects}, optimize=False)
+
+
+def open_box() -> mi.Mesh:
+    """The box without its face at +z."""
+    corners = CENTRE + HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4)]
+    faces = np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))])
+    return meshes.flat_mesh("box", corners, faces, mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}}))
+
+
+def assert_right(scene: mi.Scene):
+    """Derivatives of the moving box are those of finite differences, up to 1 %."""
+    motion = perturb(scene, "box.vertex_positions", DIRECTION)
+    gain, error = assert_grad_close(forward(motion, SPEC, 16, 256), fd(motion, SPEC, STEP, 64, 2048), 0.007)
+    assert abs(gain - 1) < 0.01 + error
+
+
+def assert_alike(scene: mi.Scene, nearby: mi.Scene):
+    """One derivative where a face is in line, as the limit of where it is not.
+
+    The face appears on one side only: finite differences would mix two derivatives.
+    """
+    image, other = (
+        forward(perturb(s, "box.vertex_positions", DIRECTION), SPEC, 4, 1024).mean(0) for s in (scene, nearby)
+    )
+    assert np.linalg.norm(image - other) < 0.01 * np.linalg.norm(other)
+
+
+@pytest.mark.parametrize(
+    "axis, angle",
+    [
+        ((0, 1, 0), 90),
+        pytest.param((0, 1, 0), 180, marks=pytest.mark.slow),
+        pytest.param((1, 0, 0), 90, marks=pytest.mark.slow),
+    ],
+)
+def test_a_box_seen_along_its_faces(llvm, axis, angle):
+    assert_right(scene_of(orthographic(axis, angle)))
+
+
+@pytest.mark.parametrize(
+    "x, y",
+    [(RIGHT, 0.3), pytest.param(RIGHT, 1.3, marks=pytest.mark.slow), pytest.param(LEFT, 0.3, marks=pytest.mark.slow)],
+)
+def test_a_perspective_camera_in_the_plane_of_a_face(llvm, x, y):
+    """The face turns away: the derivative is that of the box a little further, when the face has turned indeed."""
+    camera = perspective((x, y, 4), (x / 2, 0, 0))
+    assert_alike(scene_of(camera), scene_of(camera, FURTHER * np.sign(x)))
+
+
+@pytest.mark.slow
+def test_the_inside_of_an_open_box(llvm):
+    """Its walls are borders seen edge-on, and the edges at its bottom the outline; nothing hides them."""
+    assert_right(scene_of(orthographic((0, 1, 0), 180), box=open_box()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lamp", ["sun", "point"])
+def test_the_shadow_of_a_box_lit_along_its_faces(llvm, lamp):
+    lamps = {
+        "sun": {"type": "directional", "to_world": T().rotate([0, 1, 0], 180)},
+        "point": {"type": "point", "position": [RIGHT, 0.3, 4], "intensity": 20.0},
+    }
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(4), "bsdf": {"type": "diffuse"}}
+    camera = perspective((3, 2, 4), (0, 0, -1.2))
+    scene, nearby = (scene_of(camera, shift, lamp=lamps[lamp], floor=floor) for shift in (0.0, FURTHER))
+    if lamp == "sun":
+        assert_right(scene)
+    else:
+        assert_alike(scene, nearby)

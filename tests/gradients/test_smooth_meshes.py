@@ -1,0 +1,116 @@
+"""Smooth-shaded meshes, which are black where their shading normals turn away from the viewer, before the outline.
+
+The step from that dark fringe to the lit face is counted with the outline, as seen from beyond the fringe: what a
+mesh of this fineness loses by that is the tolerance.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fd, forward
+
+from benchmarks import meshes
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.statistics import gain
+
+X = (1, 0, 0)
+SEEDS = 16
+STEP, TURN = 0.01, 0.003  # of finite differences [scene units, rad]: a tenth of a pixel at most
+TORUS_RADII = 1.0, 0.4  # of the ring, and of the tube
+LIGHT = {"emitter": {"type": "area"}}
+REFLECTOR = {"bsdf": {"type": "diffuse"}}
+
+MERGED, FINE = 0.03, 0.01  # accepted error of a gain: in general, and of reflecting spheres seen along their rings
+GLOWING_TORUS = 0.04  # which loses more
+MAX_STDERR = 0.01
+
+
+def smooth_mesh(points: np.ndarray, normals: np.ndarray, faces: np.ndarray, **children: dict) -> mi.Mesh:
+    """A mesh shaded by interpolated `normals` (V, 3), one for each of `points` (V, 3)."""
+    props = mi.Properties()
+    for name, child in children.items():
+        props[name] = mi.load_dict(child)
+    mesh = mi.Mesh("shape", len(points), len(faces), has_vertex_normals=True, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["vertex_normals"] = (a.ravel().astype(np.float32) for a in (points, normals))
+    params["faces"] = faces.ravel().astype(np.uint32)
+    params.update()
+    return mesh
+
+
+def sphere(segments: int, **children: dict) -> mi.Mesh:
+    """A unit sphere with its poles on the z axis: seen from the side, its outline follows two meridians."""
+    points, faces = meshes.ball(segments // 2, segments)
+    x, y, z = ((points - meshes.CENTRE) / meshes.RADIUS).T
+    normals = np.stack([x, -z, y], -1)
+    return smooth_mesh(normals, normals, faces, **children)
+
+
+def torus(segments: int, **children: dict) -> mi.Mesh:
+    """A torus about the z axis, twice as many segments along the ring as around the tube."""
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(segments), np.arange(segments // 2), indexing="ij"))
+    φ, θ = 2 * np.pi * i / segments, 4 * np.pi * j / segments
+    ring = np.stack([np.cos(φ), np.sin(φ), 0 * φ], -1)
+    normals = np.cos(θ)[:, None] * ring + np.sin(θ)[:, None] * np.array([0, 0, 1])
+    right, up = (i + 1) % segments, (j + 1) % (segments // 2)
+    a, b, c, d = (u * (segments // 2) + v for u, v in ((i, j), (right, j), (right, up), (i, up)))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return smooth_mesh(TORUS_RADII[0] * ring + TORUS_RADII[1] * normals, normals, faces, **children)
+
+
+def scene_of(shape: mi.Mesh) -> mi.Scene:
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
+    pose = mi.ScalarTransform4f().look_at(origin=[0.3, -6, 1], target=[0, 0, 0], up=[0, 0, 1])
+    camera = {"type": "perspective", "fov": 34, "to_world": pose, "film": film}
+    lamp = {"type": "point", "position": [3, -5, 4], "intensity": 50.0}
+    lights = {} if shape.is_emitter() else {"lamp": lamp}
+    return mi.load_dict({"type": "scene", "shape": shape, "camera": camera, **lights}, optimize=False)
+
+
+def assert_gain(shape: mi.Mesh, tolerance: float, param: str, **how):
+    """The derivative's gain against finite differences is 1 up to `tolerance` and its error."""
+    motion = perturb(scene_of(shape), param, **how)
+    spec = {"type": "psdr_path", "max_depth": 1 if shape.is_emitter() else 2}
+    reference = fd(motion, spec, STEP if "direction" in how else TURN, 64, 1024)
+    slope = gain(forward(motion, spec, SEEDS, 512), reference[0::2], reference[1::2])
+    assert slope.stderr < MAX_STDERR, slope
+    assert abs(slope.value - 1) < tolerance + 2 * slope.stderr, slope
+
+
+MOVED = ("shape.vertex_positions", {"direction": X})
+TURNED = ("shape.vertex_positions", {"rotate": X})
+SEEN_BY_MOVED = ("camera.to_world", {"direction": X})
+SEEN_BY_TURNED = ("camera.to_world", {"rotate": (0, 0, 1)})
+EVERY_WAY = [
+    pytest.param(*MOVED, id="moved"),
+    pytest.param(*SEEN_BY_MOVED, id="camera-moved", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("segments", [24, pytest.param(64, marks=pytest.mark.slow), 200])
+@pytest.mark.parametrize("param, how", EVERY_WAY)
+def test_a_glowing_sphere(llvm, segments, param, how):
+    """An area light shines to the front of the shading normal alone."""
+    assert_gain(sphere(segments, **LIGHT), MERGED, param, **how)
+
+
+@pytest.mark.parametrize(
+    "segments", [pytest.param(24, marks=pytest.mark.slow), 64, pytest.param(200, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("param, how", EVERY_WAY)
+def test_a_diffuse_sphere(llvm, segments, param, how):
+    assert_gain(sphere(segments, **REFLECTOR), FINE if segments >= 64 else MERGED, param, **how)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [LIGHT, REFLECTOR], ids=["light", "reflector"])
+@pytest.mark.parametrize(
+    "param, how",
+    [MOVED, TURNED, SEEN_BY_MOVED, SEEN_BY_TURNED],
+    ids=["moved", "turned", "camera-moved", "camera-turned"],
+)
+def test_a_torus(llvm, kind, param, how):
+    """Its outline also passes in front of the torus itself."""
+    assert_gain(torus(200, **kind), GLOWING_TORUS if kind is LIGHT else MERGED, param, **how)
