@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks import rows
 from benchmarks.suites import ON_REQUEST, REFERENCE, SUITES, suite
 from benchmarks.worker import DONE, START
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 from psdr_jit.errors import PsdrError
 from psdr_jit.scene import io as scene_io
 
@@ -91,7 +91,7 @@ def done(folder: Path, names: tuple[str, ...]) -> set[Task]:
 def measure(pending: list[Task], args: argparse.Namespace) -> int:
     """One worker per case; the number of tasks that a worker did not survive."""
     lost, finished = 0, 0
-    with _common.progress_bar("bench", quiet=False) as report:
+    with common.progress_bar("bench", quiet=False) as report:
         for name, case in dict.fromkeys((task.suite, task.case) for task in pending):
             left = [task.method for task in pending if (task.suite, task.case) == (name, case)]
             while left:
@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     args.out = (args.out or (QUICK_FOLDER if args.quick else rows.RESULTS)).resolve()
     try:
         if args.budget is not None:
-            _common.require_positive(budget=args.budget)
+            common.require_positive(budget=args.budget)
         args.out.mkdir(parents=True, exist_ok=True)
     except (PsdrError, OSError) as error:
         print(f"psdr bench: error: {error}", file=sys.stderr)

@@ -12,6 +12,7 @@ from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
 from psdr_jit.derivative.integrator_specs import require_samples
 from psdr_jit.driver.prepare import Prepared, prepare
+from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
 from psdr_jit.plan.call import Call
@@ -25,7 +26,7 @@ class TermIntegrator(ADIntegrator):
     """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's `path`."""
 
     def __init__(self, props):
-        self.options = Options.from_properties(props)
+        self.options = Options.from_properties(props, [term.budget for term in TERMS])
         super().__init__(props)
         self.memory = Memory()
         self.plan: Plan | None = None  # of the latest derivative

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from numbers import Integral
 
@@ -45,18 +46,19 @@ class Options:
     form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
     plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS
+    more_budgets: tuple[tuple[str, int | None], ...] = ()  # of terms that bring a budget of their own, by name
 
     def __post_init__(self):
-        for field in fields(self):
-            self._require_type(field.name, getattr(self, field.name), field.default)
+        for name, default in _properties():
+            self._require_type(name, getattr(self, name), default)
         if self.max_depth < 0 and self.max_depth != -1:
             raise OptionError(f"max_depth = {self.max_depth}: use a depth >= 0, or -1 for unlimited")
         if self.rr_depth <= 0:
             raise OptionError(
                 f"rr_depth = {self.rr_depth}: use a depth >= 1 (a large one switches roulette off)"
             )
-        for name in BUDGETS:
-            value = getattr(self, name)
+        for name, value in self._budgets.items():
+            self._require_type(name, value, None)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
         for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS)):
@@ -84,14 +86,19 @@ class Options:
             require_count(name, value, f' (<integer name="{name}" .../> in a scene file)')
 
     @staticmethod
-    def from_properties(props) -> Options:
-        """Read every field from Mitsuba `Properties`; the loader then rejects whatever was not read."""
-        return Options(**{f.name: props.get(f.name, f.default) for f in fields(Options)})
+    def from_properties(props, budgets: Iterable[str] = ()) -> Options:
+        """Read every field from Mitsuba `Properties`, and `budgets` that are none; the loader rejects what is left."""
+        more = tuple((name, props.get(name, None)) for name in dict.fromkeys(budgets) if name not in BUDGETS)
+        return Options(**{name: props.get(name, default) for name, default in _properties()}, more_budgets=more)
+
+    @property
+    def _budgets(self) -> dict[str, int | None]:
+        return {name: getattr(self, name) for name in BUDGETS} | dict(self.more_budgets)
 
     def budget(self, name: str) -> int | None:
         """Samples per pixel under the property `name`, or under the one that it follows if it is not set."""
-        value = getattr(self, name)
-        return getattr(self, FOLLOWS[name]) if value is None and name in FOLLOWS else value
+        value = self._budgets[name]
+        return self._budgets[FOLLOWS[name]] if value is None and name in FOLLOWS else value
 
     @property
     def plan_is_given(self) -> bool:
@@ -101,12 +108,17 @@ class Options:
     @property
     def budgets_set(self) -> bool:
         """Does any term have a budget of its own?"""
-        return any(getattr(self, name) is not None for name in BUDGETS)
+        return any(value is not None for value in self._budgets.values())
 
     @property
     def depth_limit(self) -> int:
         """`max_depth` with -1 replaced by Mitsuba's largest depth."""
         return UNLIMITED if self.max_depth == -1 else self.max_depth
+
+
+def _properties() -> list[tuple[str, object]]:
+    """`(name, default)` of the fields that are properties of the integrator."""
+    return [(field.name, field.default) for field in fields(Options) if field.name != "more_budgets"]
 
 
 def require_count(name: str, value, hint: str = "") -> None:

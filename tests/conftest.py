@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+
 import drjit as dr
 import mitsuba as mi
 import pytest
 
 import psdr_jit  # noqa: F401  (registers the plugins)
+
+#: Set in the processes of a parallel run. Kernels of the tests are small: one thread for each of these processes.
+IN_PARALLEL = "PYTEST_XDIST_WORKER" in os.environ
 
 BACKENDS = {"llvm": dr.JitBackend.LLVM, "cuda": dr.JitBackend.CUDA}
 
@@ -20,6 +25,8 @@ def activate(name: str) -> str:
     if mi.variant() != name:
         mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)
+    if IN_PARALLEL:
+        dr.set_thread_count(1)
     return name
 
 

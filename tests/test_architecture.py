@@ -13,6 +13,9 @@ import psdr_jit
 
 ROOT = Path(psdr_jit.__file__).parent
 MAX_LINES = 300
+MAX_FUNCTION = 60  # lines
+MAX_PARAMETERS = 8
+PUBLIC = {f"psdr_jit.{name}" for name in (*psdr_jit.__all__, "finite_differences")}
 LAST_RESORT = "cli.main"  # turns whatever arrives into one line and an exit status
 
 ROOMS = (
@@ -103,6 +106,17 @@ def test_unit_tests_mirror_the_rooms():
 def test_files_are_short(module):
     lines = modules()[module].read_text(encoding="utf-8").count("\n")
     assert lines <= MAX_LINES, f"{module} has {lines} lines: one file, one concept"
+
+
+@pytest.mark.parametrize("module", modules())
+def test_functions_are_short_and_take_little(module):
+    """Options of the public functions, keyword-only, are not counted: they are names, not positions."""
+    for node in ast.walk(ast.parse(modules()[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < MAX_FUNCTION, f"{module}.{node.name}: one function, one step"
+            given = [a.arg for a in node.args.posonlyargs + node.args.args if a.arg not in ("self", "cls")]
+            options = [] if f"psdr_jit.{node.name}" in PUBLIC else [a.arg for a in node.args.kwonlyargs]
+            assert len(given) + len(options) <= MAX_PARAMETERS, f"{module}.{node.name}: group what belongs together"
 
 
 @pytest.mark.parametrize("module", modules())

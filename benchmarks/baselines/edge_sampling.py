@@ -167,11 +167,11 @@ def along_paths(job: Job, table: EdgeTable, dist: EdgeDistribution, p) -> mi.Spe
     path = first_arrivals(job, p)
     k = 1  # the vertex: x_k
     # one segment is left for the emitter
-    while k < job.options.depth_limit and dr.width(path.lane) > 0:
+    while k < job.options.depth_limit and path is not None:
         seed = mi.sample_tea_32(p.seed, mi.UInt32(k))[0]
         si, u = arrive(path)
         view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.spp)
-        if dr.width(view.lane) > 0:
+        if view is not None:
             rng = stream_seed(seed, Stream.INDIRECT_RADIANCE)
             dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.spp))
         if k + 1 < job.options.depth_limit:
@@ -180,7 +180,7 @@ def along_paths(job: Job, table: EdgeTable, dist: EdgeDistribution, p) -> mi.Spe
     return dL
 
 
-def first_arrivals(job: Job, p) -> CameraPath:
+def first_arrivals(job: Job, p) -> CameraPath | None:
     """Camera rays that meet a surface."""
     n = dr.width(p.pos)
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
@@ -214,7 +214,9 @@ def arrive(path: CameraPath) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
     return dr.detach(si), u
 
 
-def sample_view(job: Job, table: EdgeTable, dist: EdgeDistribution, path: CameraPath, si, u, seed, spp) -> EdgeView:
+def sample_view(
+    job: Job, table: EdgeTable, dist: EdgeDistribution, path: CameraPath, si, u, seed, spp
+) -> EdgeView | None:
     """One edge point per vertex; kept if the vertex sees it, scatters light from there, and they move apart."""
     rng = pixel_sampler(seed, path.lane, spp)
     row, t = sample_edge(dist, mi.Float64(rng.next_1d()))
@@ -272,7 +274,7 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
     return v.weight * value * dr.select(which == 0, 1.0, -1.0), v.lane
 
 
-def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath:
+def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath | None:
     """To the next vertex, by BSDF sampling with roulette; paths that end are left out."""
     rng = pixel_sampler(seed, path.lane, spp)
     state = PathState(mi.UInt32(k - 1), path.β, path.η)

@@ -92,7 +92,7 @@ def render(request: Request) -> Renders:
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "renders.npz"
         try:
-            message = json.dumps(_message(request, output))
+            message = json.dumps(message_for(request, output))
             done = subprocess.run([python, "-I", WORKER], input=message, capture_output=True, text=True, cwd=scratch,
                                   timeout=request.timeout_seconds, check=False)  # fmt: skip
         except subprocess.TimeoutExpired as error:
@@ -104,7 +104,7 @@ def render(request: Request) -> Renders:
                            json.loads(str(found["versions"])))  # fmt: skip
 
 
-def _message(request: Request, output: Path) -> dict[str, Any]:
+def message_for(request: Request, output: Path) -> dict[str, Any]:
     """The request as the worker reads it: plain values only."""
     text = with_gaussian_filter(request.scene.read_text(encoding="utf-8"))
     value, tangent = value_and_tangent(request.motion)
@@ -188,8 +188,8 @@ def environment() -> Path:
     try:
         if folder.exists():
             shutil.rmtree(folder)  # half-made, or by an interpreter that is gone
-        _install([base, "-I", "-m", "venv", str(folder)])
-        _install([str(python), "-I", "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check",
+        run_step([base, "-I", "-m", "venv", str(folder)])
+        run_step([str(python), "-I", "-m", "pip", "install", "-q", "--no-input", "--disable-pip-version-check",
                   "--only-binary=:all:", *REQUIREMENTS])  # fmt: skip
         (folder / STAMP).write_text("\n".join(REQUIREMENTS), encoding="utf-8")
     except OSError as error:
@@ -213,7 +213,7 @@ def find_python() -> str:
     tried = []
     for name in (sys.executable, *(f"python{version}" for version in PYTHONS)):
         path = shutil.which(name)
-        reason = "not on PATH" if path is None else _obstacle(path)
+        reason = "not on PATH" if path is None else obstacle(path)
         if path is not None and not reason:
             return path
         tried.append(f"{name}: {reason}")
@@ -221,7 +221,7 @@ def find_python() -> str:
                      f"({'; '.join(tried)})")  # fmt: skip
 
 
-def _obstacle(python: str) -> str:
+def obstacle(python: str) -> str:
     """Why this interpreter does not serve; empty if it does."""
     code = "import sys, venv, ensurepip; print('%d.%d' % sys.version_info[:2])"
     try:
@@ -234,7 +234,7 @@ def _obstacle(python: str) -> str:
     return "" if done.stdout.strip() in PYTHONS else f"is {done.stdout.strip()}"
 
 
-def _install(command: Sequence[str]) -> None:
+def run_step(command: Sequence[str]) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=INSTALL_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:

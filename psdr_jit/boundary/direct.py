@@ -8,7 +8,7 @@ the sensor:
 
 ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the
 edge's material velocity, u_S the emitter point's (the interior term keeps emitter points on their material:
-`interior/sweeps.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is
+`interior/flow.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is
 the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
@@ -94,7 +94,7 @@ def sample(job: Job, edges: SecondaryEdges) -> ShadowLine:
     return ShadowLine(lane, row, t, light, pdf_row, wavelengths, weight)
 
 
-def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment:
+def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment | None:
     """The lines that end on a receiver and on a visible emitter; all others are left out (value 0)."""
     scene, light, on = job.scene, line.light, line.light.on
     active = light.valid & (light.pdf > 0) & dr.any(light.value != 0)
@@ -176,7 +176,6 @@ ESTIMATOR = SecondaryTerm(
     edges=lambda job: secondary_edges(job, NAME, Use.SHADOW),
     sample=sample,
     trace=trace,
-    lanes=lambda segment: dr.width(segment.lane),
     evaluate=evaluate,
 )
 

@@ -83,8 +83,8 @@ def sample_lines(job: Job, edges: SecondaryEdges) -> EdgeLine:
     )
 
 
-def trace_receivers(job: Job, line: EdgeLine) -> EdgeView:
-    """The lines that end on a receiver."""
+def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
+    """The lines that end on a receiver; None if there are none."""
     on, ω, n_perp, pdf_sa = line.on, line.ω, line.n_perp, line.pdf_sa
     start = on.x + on.aside * n_perp
     down = mi.Ray3f(start - on.lead * ω, -ω, 0, line.wavelengths)

@@ -86,7 +86,6 @@ ESTIMATORS = {
         edges=lambda job: secondary_edges(job, NAME, Use.STEP),
         sample=sample_lines,
         trace=lambda job, edges, line: trace_receivers(job, line),
-        lanes=lambda view: dr.width(view.lane),
         evaluate=evaluate,
     ),
     "material": SecondaryTerm(
@@ -94,7 +93,6 @@ ESTIMATORS = {
         edges=lambda job: secondary_edges(job, NAME, Use.BACKGROUND),
         sample=sample_lines,
         trace=indirect_material.trace,
-        lanes=lambda background: dr.width(background.sign),
         evaluate=indirect_material.evaluate,
     ),
 }

@@ -39,11 +39,11 @@ class Background:
     sign: mi.Float  # +1 on side −s, −1 on side +s
 
 
-def trace(job: Job, edges: SecondaryEdges, line: EdgeLine) -> Background:
+def trace(job: Job, edges: SecondaryEdges, line: EdgeLine) -> Background | None:
     """Both sides of every edge point with a receiver, as far as a surface lies there that moves against the edge."""
     view = trace_receivers(job, line)
-    if dr.width(view.lane) == 0:  # as in front of a lone convex body
-        return Background(view, view.receiver, mi.Float(), mi.Float())
+    if view is None:
+        return None
     index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
     ray, pi, beyond = look_behind(job.scene, edges.table, v.sight, which, v.wavelengths)

@@ -103,7 +103,7 @@ def seen_edge(job: Job, edges: PrimaryEdges, sample: EdgeSample) -> SeenEdge:
     return SeenEdge(sight, view, across, on.valid & view.valid & (across > 0))
 
 
-def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample:
+def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample | None:
     """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
     lower, upper = job.frame.window
     count = edge_samples(job, paths=2)
@@ -159,7 +159,7 @@ def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None])
         if edges is None:
             return None
         sample = sample_visible(job, edges)
-        if dr.width(sample.row) == 0:
+        if sample is None:
             return None
         L, alpha, wavelengths = trace_sides(job, edges, sample)
         even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))

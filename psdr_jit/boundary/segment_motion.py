@@ -50,8 +50,7 @@ class SecondaryTerm(Generic[L, S]):
     longest: Callable[[Job], int]  # vertices of the longest sensor subpath; < 1: there is nothing to estimate
     edges: Callable[[Job], SecondaryEdges | None]  # what is sampled; None: nothing can contribute
     sample: Callable[[Job, SecondaryEdges], L]  # lines through edge points
-    trace: Callable[[Job, SecondaryEdges, L], S]  # those that end where they should; the ends
-    lanes: Callable[[S], int]  # how many
+    trace: Callable[[Job, SecondaryEdges, L], S | None]  # those that end where they should, with their ends
     evaluate: Callable[[Job, SecondaryEdges, S], BoundarySamples]  # what they are worth
 
 
@@ -111,7 +110,7 @@ def _samples(job: Job, term: SecondaryTerm) -> tuple[SecondaryEdges, BoundarySam
     if edges is None:
         return None
     segments = term.trace(job, edges, term.sample(job, edges))
-    if term.lanes(segments) == 0:
+    if segments is None:
         return None
     s = term.evaluate(job, edges, segments)
     edges.rows.learn(edges.state, s.at.row, s.at.t, s.value)

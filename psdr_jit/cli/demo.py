@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 from psdr_jit.errors import OptionError
 
 NAME = "demo"
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Both parts; 0."""
-    _common.require_positive(res=args.res, iterations=args.iterations)
+    common.require_positive(res=args.res, iterations=args.iterations)
     if args.res % 32:
         raise OptionError(f"--res must be a multiple of 32, got {args.res}")
     from psdr_jit.cli import demo_run
@@ -69,7 +69,7 @@ def show_gradient(args: argparse.Namespace, scene: Any, out: Path) -> None:
     from psdr_jit.cli import demo_run
     from psdr_jit.derivative import images
 
-    with _common.progress_bar("gradient ", args.quiet) as report:
+    with common.progress_bar("gradient ", args.quiet) as report:
         result, reference = demo_run.compare(scene, args.integrator, progress=report)
     panels = [("primal", "Cornell box", result.primal),
               ("derivative", f"box moved in x: {' + '.join(result.terms) or 'total'}", result.total),
@@ -93,7 +93,7 @@ def show_recovery(args: argparse.Namespace, scene: Any, out: Path) -> None:
         return (f"loss {history.losses[k]:.5f}, off by {history.shift_px(k):.1f} px "
                 f"and {history.angle_degrees(k):.1f} degrees")
 
-    with _common.progress_bar("recovery ", args.quiet) as report:
+    with common.progress_bar("recovery ", args.quiet) as report:
         history = demo_run.recover_pose(scene, args.integrator, args.iterations,
                                     progress=lambda done, total, h: report(done, total, note(h)))
     png = images.write_panels(out / "recovery.png", [("primal", "target", history.target),

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 from psdr_jit.errors import OptionError
 
 NAME = "gradient"
@@ -21,12 +21,12 @@ OK, CHECK_FAILED = 0, 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    _common.add_scene_arguments(parser)
+    common.add_scene_arguments(parser)
     parser.add_argument("--wrt", required=True, metavar="PARAM", help="parameter; 'psdr params' lists them")
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--direction", type=_common.vector, metavar="x,y,z",
+    way.add_argument("--direction", type=common.vector, metavar="x,y,z",
                      help="translation in world space, or one number per colour channel")
-    way.add_argument("--rotate", type=_common.vector, metavar="x,y,z",
+    way.add_argument("--rotate", type=common.vector, metavar="x,y,z",
                      help="world axis through the shape's centre; the derivative is per radian")
     way.add_argument("--index", type=int, metavar="I", help="one scalar of the parameter")
     # argparse takes -1,0,0 for an option unless told that it is a number
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render, write, check; 0, or 1 for a check that did not pass."""
-    _common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
+    common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
                              check_seconds=args.check_seconds)
     from psdr_jit.derivative import images, integrator_specs
     from psdr_jit.derivative.gradient import gradient
@@ -55,11 +55,11 @@ def run(args: argparse.Namespace) -> int:
 
     exr, png = outputs(args)
     scene_io.use_variant(args.variant)
-    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene = scene_io.load_scene(args.scene, **common.definitions(args))
     scene_io.check_sensor(scene, args.sensor)
-    spec = _common.integrator_of(args, scene)
+    spec = common.integrator_of(args, scene)
     parameter = perturb(scene, args.wrt, args.direction, rotate=args.rotate, index=args.index)
-    with _common.progress_bar("gradient", args.quiet) as report:
+    with common.progress_bar("gradient", args.quiet) as report:
         result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds,
                           sensor=args.sensor, progress=report)
     images.write_exr(exr, result.layers(), result.metadata())
@@ -91,7 +91,7 @@ def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, 
     from psdr_jit.derivative.check import check_gradient
 
     limit = args.check_seconds
-    with _common.progress_bar("check", args.quiet) as report:
+    with common.progress_bar("check", args.quiet) as report:
         result = check_gradient(
             scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor, max_seconds=limit,
             progress=lambda t, v: report(t, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}"))

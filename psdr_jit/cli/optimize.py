@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 from psdr_jit.errors import OptionError, StorageError
 
 NAME = "optimize"
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from psdr_jit.inverse import loop
     from psdr_jit.scene import io as scene_io
 
-    _common.require_positive(iterations=args.iterations, max_seconds=args.max_seconds)
+    common.require_positive(iterations=args.iterations, max_seconds=args.max_seconds)
     if args.perturb is not None and args.perturb < 0:
         raise OptionError(f"--perturb must be from 0 on, got {args.perturb}")
     scene_io.use_variant(args.variant)
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     loop.require_folder(out, args.resume)  # before targets are rendered
     problem = configs.problem_of(config)
     start = time.perf_counter()
-    with _common.progress_bar("optimize", args.quiet) as report:
+    with common.progress_bar("optimize", args.quiet) as report:
         result = loop.run(problem, out, args.resume, report)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 
 NAME = "params"
 HELP = "list the parameters of a scene"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    _common.add_scene_arguments(parser)
+    common.add_scene_arguments(parser)
     parser.add_argument("--all", action="store_true", help="list those that cannot be differentiated as well")
 
 
@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from psdr_jit.scene.params import differentiable_params
 
     scene_io.use_variant(args.variant)
-    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene = scene_io.load_scene(args.scene, **common.definitions(args))
     infos = differentiable_params(scene)
     shown = [i for i in infos if i.differentiable or args.all]
     rows = [("parameter", "kind", "shape", "d?", "remark")]

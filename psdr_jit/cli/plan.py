@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import argparse
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 
 NAME = "plan"
 HELP = "show what differentiating a scene would compute, and why"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    _common.add_scene_arguments(parser)
+    common.add_scene_arguments(parser)
     parser.add_argument("--wrt", action="append", default=[], metavar="PARAM",
                         help="parameter to differentiate by, may be repeated; 'psdr params' lists them")
     parser.add_argument("--spp", type=int, metavar="N", help="samples per pixel (default: the scene's own)")
@@ -25,12 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the table; 0."""
-    _common.require_positive(spp=args.spp, max_depth=args.max_depth)
+    common.require_positive(spp=args.spp, max_depth=args.max_depth)
     from psdr_jit.derivative.make_plan import make_plan
     from psdr_jit.scene import io as scene_io
 
     scene_io.use_variant(args.variant)
-    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene = scene_io.load_scene(args.scene, **common.definitions(args))
     scene_io.check_sensor(scene, args.sensor)
-    print(make_plan(scene, args.wrt, args.sensor, _common.integrator_of(args, scene), args.spp or 0))
+    print(make_plan(scene, args.wrt, args.sensor, common.integrator_of(args, scene), args.spp or 0))
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from psdr_jit.cli import _common
+from psdr_jit.cli import common
 from psdr_jit.errors import OptionError
 
 NAME = "render"
@@ -13,7 +13,7 @@ HELP = "render a scene"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    _common.add_scene_arguments(parser)
+    common.add_scene_arguments(parser)
     parser.add_argument("-o", "--output", metavar="FILE",
                         help=".exr or .png (default: the scene's name with .exr, in this folder)")
     parser.add_argument("--spp", type=int, help="samples per pixel (default: the scene's own)")
@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render and write; 0."""
-    _common.require_positive(spp=args.spp)
-    _common.require_seed(args.seed)
+    common.require_positive(spp=args.spp)
+    common.require_seed(args.seed)
     from psdr_jit.derivative import images
     from psdr_jit.scene import io as scene_io
 
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if output.suffix.lower() not in (".exr", ".png"):
         raise OptionError(f"cannot write '{output}': the name must end in .exr or .png")
     scene_io.use_variant(args.variant)
-    scene = scene_io.load_scene(args.scene, **_common.definitions(args))
+    scene = scene_io.load_scene(args.scene, **common.definitions(args))
     scene_io.check_sensor(scene, args.sensor)
 
     import mitsuba as mi

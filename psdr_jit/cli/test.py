@@ -46,9 +46,21 @@ def run(args: argparse.Namespace) -> int:
         raise SetupError(f"pytest is not installed; run:  {sys.executable} -m pip install -e '{root}[test]'")
     llvm.ensure_llvm()
     given = [absolute(word, root) for word in args.rest]
-    command = [sys.executable, "-m", "pytest", *given]
+    command = [sys.executable, "-m", "pytest", *processes(given), *given]
     status = subprocess.run(command, cwd=root, env=environment(), check=False).returncode
     return EXIT_STATUS.get(status, 1)
+
+
+def processes(given: list[str]) -> list[str]:
+    """Options that let pytest use all cores: most of its time is spent compiling kernels, each on one core.
+
+    Neighbouring tests share kernels, so each process starts with a stretch of them and takes over what is left of the
+    other's. Not where pytest is told to do otherwise, or to talk to a terminal.
+    """
+    alone = ("-n", "--numprocesses", "--dist", "--pdb", "-s", "--capture", "--collect-only", "--co", "-p")
+    if any(word.startswith(alone) for word in given) or importlib.util.find_spec("xdist") is None:
+        return []
+    return ["-n", "auto", "--dist", "worksteal"]
 
 
 def absolute(word: str, root: Path) -> str:

@@ -10,10 +10,11 @@ import mitsuba as mi
 T = TypeVar("T")
 
 
-def compact(record: T, active: mi.Bool) -> T:
-    """The lanes of `record` (a dataclass of arrays) that are active. Evaluates.
+def compact(record: T, active: mi.Bool) -> T | None:
+    """The lanes of `record` (a dataclass of arrays) that are active; None if there are none. Evaluates.
 
     All fields are evaluated in one kernel first: a gather from pending arrays would launch one for each.
     """
     dr.eval(record, active)
-    return dr.gather(type(record), record, dr.compress(active))
+    kept = dr.compress(active)
+    return dr.gather(type(record), record, kept) if dr.width(kept) > 0 else None

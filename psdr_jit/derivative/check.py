@@ -94,17 +94,28 @@ def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *,
     slope = gain(d.group_means(), f1.group_means(), f2.group_means())
     halves = np.concatenate((f1.group_means(), f2.group_means()))
     test = block_test(d.group_means(), halves, block, floor)
-    decision, reason = _decide(slope, test, d, f1, f2, block, tolerance, max_stderr, zero_bound)
+    decision, reason = _decide(slope, test, (d, f1, f2), block, _Rule(tolerance, max_stderr, zero_bound))
     return Verdict(decision, reason, slope.value, slope.stderr, test.rms_z, test.max_z, test.blocks)
 
 
-def _decide(slope: Gain, test: BlockTest, d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int,
-            tolerance: float, max_stderr: float, zero_bound: float | None) -> tuple[str, str]:
-    if min(d.total, f1.total, f2.total) < MIN_SEEDS:
+@dataclass(frozen=True)
+class _Rule:
+    """What counts as right; see `check_gradient`."""
+
+    tolerance: float
+    max_stderr: float
+    zero_bound: float | None
+
+
+def _decide(slope: Gain, test: BlockTest, images: tuple[GroupedImages, ...], block: int,
+            rule: _Rule) -> tuple[str, str]:
+    """`(decision, reason)`; `images`: the estimate and two halves of finite differences."""
+    seeds = min(group.total for group in images)
+    if seeds < MIN_SEEDS:
         return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds"
-    if zero_bound is not None:
-        return _judge_zero(d, f1, f2, block, zero_bound)
-    if slope.power == 0 and not d.mean().any():
+    if rule.zero_bound is not None:
+        return _judge_zero(*images, block, rule.zero_bound)
+    if slope.power == 0 and not images[0].mean().any():
         return PASS, "estimate and finite differences are both exactly zero"
     if not slope.has_signal:
         if test.max_z > MAX_Z:
@@ -112,7 +123,7 @@ def _decide(slope: Gain, test: BlockTest, d: GroupedImages, f1: GroupedImages, f
                           f"max |z| {test.max_z:.1f}")
         return INCONCLUSIVE, ("finite differences cannot be told from zero; if the gradient ought to vanish, "
                               "give an absolute bound (zero_bound)")
-    return _judge_gain(slope, test, min(d.total, f1.total, f2.total), tolerance, max_stderr)
+    return _judge_gain(slope, test, seeds, rule.tolerance, rule.max_stderr)
 
 
 def _slightly_scattered(test: BlockTest) -> bool:

@@ -17,7 +17,7 @@ from ..core.film import require_film
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..errors import OptionError, ZeroDerivativeWarning
-from ..options import require_runtime, samples_per_pixel
+from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
@@ -85,7 +85,7 @@ def prepare(call: Call) -> Prepared:
     if call.mode == "backward":
         warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())
-    plan, log = _plan(question) if given is None else (_require_terms(given), None)
+    plan, log = _plan(question) if given is None else (_as_given(given, call.options), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
@@ -94,15 +94,17 @@ def prepare(call: Call) -> Prepared:
     return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
 
 
-def _require_terms(plan: Plan) -> Plan:
-    """A plan that was given must speak of the terms that there are."""
+def _as_given(plan: Plan, options: Options) -> Plan:
+    """A plan that was given must speak of the terms that there are; it is executed but for terms with a budget of 0."""
     known, named = [t.name for t in TERMS], [t.name for t in plan.terms]
     if sorted(known) != sorted(named):
         raise OptionError(
             f"the given plan has the terms {', '.join(named)}, but there are {', '.join(known)}: "
             "make it anew with psdr_jit.make_plan"
         )
-    return plan
+    budgets = {t.name: options.budget(t.budget) for t in TERMS}
+    off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0}
+    return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
 
 
 def _facts(call: Call) -> SceneFacts:

@@ -1,7 +1,7 @@
 """The table of derivative terms that an integrator sums.
 
-Adding a term: one file with its estimator and its `TERM` (`plan.term` says what that is), one entry here, one budget in
-`options.py`. Planning, pilot, command line and tests iterate over this table and know no term by name.
+Adding a term: one file with its estimator and its `TERM` (`plan.term` says what that is), and one entry here. Planning,
+pilot, command line and tests iterate over this table and know no term by name.
 """
 
 from __future__ import annotations

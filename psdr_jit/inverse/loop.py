@@ -80,7 +80,7 @@ def run(
 
 
 def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> Result:
-    state = _begin(problem)
+    state = begin(problem)
     if resume:
         _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
     journal = Journal(folder, problem, keep=state.iteration)
@@ -130,7 +130,7 @@ class Stepper:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self._state = _begin(problem)
+        self._state = begin(problem)
         problem.apply(self._state.latents)
         self._journal = Journal(None, problem, keep=0)
 
@@ -203,7 +203,7 @@ def _say_diverged(state: _State, what: str) -> None:
     warnings.warn(said, RuntimeWarning, stacklevel=5)
 
 
-def _begin(problem: Problem) -> _State:
+def begin(problem: Problem) -> _State:
     latents = problem.start()
     history = History(problem.period, problem.loss.images > 1, copied(latents))
     optimisers = {}

@@ -1,7 +1,7 @@
 """What a term of the derivative is: one record, over which everything that concerns terms iterates.
 
-Adding a term: a file with its estimator and its `TERM`, an entry in `driver.terms`, a budget in `options`, a scene and
-a test. Nothing else knows terms by their names.
+Adding a term: a file with its estimator and its `TERM`, an entry in `driver.terms`, a scene and a test. Nothing else
+knows terms by their names; a budget that is no field of `options.Options` becomes a property of the integrator.
 """
 
 from __future__ import annotations

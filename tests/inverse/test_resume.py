@@ -162,7 +162,7 @@ def test_moments_are_restored(llvm):
     for _ in range(3):
         stepper.step()
     kept = stepper.arrays()
-    other = loop._begin(problem)
+    other = loop.begin(problem)
     checkpoints.restore_optimisers(other.optimisers, kept)
     again = checkpoints.optimiser_arrays(other.optimisers)
     assert set(again) == set(kept) and all(np.array_equal(again[name], kept[name]) for name in kept)

@@ -48,7 +48,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         python.touch()
         ran.append(command)
 
-    monkeypatch.setattr(reparam, "_install", install)
+    monkeypatch.setattr(reparam, "run_step", install)
     monkeypatch.setattr(reparam, "find_python", lambda: "python")
     return ran
 
@@ -143,7 +143,7 @@ def test_an_installation_that_fails_leaves_no_stamp(cache: Path, monkeypatch: py
 
 def test_missing_interpreters_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(reparam, "_obstacle", lambda _: "is 3.14")
+    monkeypatch.setattr(reparam, "obstacle", lambda _: "is 3.14")
     with pytest.raises(SetupError, match=r"needs Python 3\.8 to 3\.12.*is 3\.14; python3\.12: not on PATH"):
         reparam.find_python()
 
@@ -157,6 +157,6 @@ def test_the_worker_needs_nothing_of_ours() -> None:
 
 
 def test_requests_are_plain_json(llvm: str, tmp_path: Path) -> None:
-    message = json.loads(json.dumps(reparam._message(request(load={"res": 4, "rfilter": "box"}), tmp_path / "out")))
+    message = json.loads(json.dumps(reparam.message_for(request(load={"res": 4, "rfilter": "box"}), tmp_path / "out")))
     assert message["load"] == {"res": "4"} and message["param"] == CUBE and message["folder"] == str(SCENE.parent)
     assert message["integrator"] == {"type": "prb_reparam", "max_depth": 2}

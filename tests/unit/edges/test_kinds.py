@@ -1,0 +1,161 @@
+"""What `edges.kind` promises, checked for every kind of edge that the shipped scenes have."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from psdr_jit.core.ad import tangents
+from psdr_jit.core.low_discrepancy import lane_sampler
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.driver.prepare import prepare
+from psdr_jit.edges.kind import EdgeKind, FixedKind, Sight, Use
+from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_junction import Junctions
+from psdr_jit.edges.kind_mesh import MeshEdges
+from psdr_jit.edges.scene_table import scene_edges
+from psdr_jit.scene import io as scene_io
+from psdr_jit.scene.params import also_enabled
+
+COUNT = 4096
+SHIFT = (0.48, 0.6, 0.64)
+PLACES = {  # kind: a scene that has it, and what moves there
+    MeshEdges: ("lit_box", ["box.vertex_positions"]),
+    Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
+    AnalyticCurves: ("ball_shadow", ["blocker.to_world"]),
+}
+
+
+def subclasses(base: type) -> set[type]:
+    found = {c for child in base.__subclasses__() for c in {child, *subclasses(child)}}
+    return {c for c in found if not getattr(c, "__abstractmethods__", None)}
+
+
+def test_every_kind_is_looked_at():
+    assert subclasses(EdgeKind) == set(PLACES)
+
+
+@pytest.fixture(params=PLACES, ids=lambda kind: kind.__name__)
+def found(request, llvm):
+    """`(job, kind)`: a kind of edge in a scene where something moves."""
+    name, moving = PLACES[request.param]
+    scene = scene_io.load_scene(scene_io.shipped_scene(f"{name}.xml"), res=16)
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": "spatial", "sppc": 1})
+    with also_enabled(scene, [name for name in moving if name in set(mi.traverse(scene).keys())]):
+        job = prepare(integrator.call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]
+        (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, request.param))
+    return job, kind
+
+
+def lines(kind: EdgeKind, row: mi.UInt32, t: mi.Float, rng):
+    """Random lines through edge points: `(OnEdge, ω)`."""
+    ω = mi.warp.square_to_uniform_sphere(rng.next_2d())
+    return kind.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), mi.Bool(True)), ω
+
+
+def rows_of(kind: EdgeKind, seed: int = 1):
+    rng = lane_sampler(mi.UInt32(seed), dr.arange(mi.UInt32, COUNT))
+    row = mi.UInt32(rng.next_1d() * kind.count)
+    return row, rng.next_1d(), rng
+
+
+def test_columns_have_the_width_of_the_rows(found):
+    job, kind = found
+    assert kind.count > 0
+    assert dr.width(kind.places()) == kind.count
+    moving = np.broadcast_to(np.array(kind.moving()), kind.count)
+    assert moving.any()
+    for weights in (kind.film_weights(job.frame, 1), *(kind.line_weights(use) for use in Use)):
+        values = np.broadcast_to(np.array(weights), kind.count)
+        assert np.isfinite(values).all() and (values >= 0).all()
+    assert (np.array(kind.line_weights(Use.STEP)) > 0).any()
+
+
+def test_points_lie_on_the_edge_and_know_its_tangent(found):
+    """x(t) and dx/dt agree by finite differences, for one line at a time."""
+    _, kind = found
+    row, t, rng = rows_of(kind)
+    h = 1e-2
+    t = 0.1 + 0.8 * t
+    a, ω = lines(kind, row, t - h, lane_sampler(mi.UInt32(5), dr.arange(mi.UInt32, COUNT)))
+    b, _ = lines(kind, row, t + h, lane_sampler(mi.UInt32(5), dr.arange(mi.UInt32, COUNT)))
+    middle, _ = lines(kind, row, t, lane_sampler(mi.UInt32(5), dr.arange(mi.UInt32, COUNT)))
+    valid = np.array(a.valid & b.valid & middle.valid & dr.full(mi.Bool, True, COUNT))
+    slope = np.array((b.x - a.x) / (2 * h)).T[valid]
+    dx = np.array(middle.dx + dr.zeros(mi.Vector3f, COUNT)).T[valid]
+    assert len(dx) > COUNT / 4
+    assert np.abs(slope - dx).max() < 2e-3 * np.abs(dx).max() + 1e-4
+
+
+def test_what_is_across_is_across(found):
+    _, kind = found
+    row, t, rng = rows_of(kind)
+    on, ω = lines(kind, row, t, rng)
+    n_perp, across = on.across(ω)
+    seen = np.array(on.valid & (across > 1e-4))
+    assert seen.any()
+    for other in (ω, on.dx):
+        assert np.abs(np.array(dr.dot(n_perp, other)))[seen].max() < 1e-4 * max(1, np.abs(np.array(on.dx)).max())
+    assert np.allclose(np.array(dr.norm(n_perp))[seen], 1, atol=1e-5)
+    assert np.allclose(np.array(across)[seen], np.array(dr.norm(dr.cross(on.dx, ω)))[seen], rtol=1e-5)
+
+
+def test_everything_shifted_shifts_the_edge(found):
+    """Across the edge, the displacement of whatever moves along SHIFT is SHIFT's own part."""
+    job, kind = found
+    row, t, rng = rows_of(kind)
+    on, ω = lines(kind, row, t, rng)
+    n_perp, across = on.across(ω)
+    sight = Sight.of(on, row, t, ω, mi.Float(1), n_perp)
+    params, θ = mi.traverse(job.scene), mi.Float(0)
+    dr.enable_grad(θ)
+    still = ("camera", "light", "lamp")
+    for name in [k for k in params.keys() if k.endswith(("vertex_positions", "to_world")) and not k.startswith(still)]:
+        params[name] = moved(params[name], θ)
+    params.update()
+    dr.forward(θ, dr.ADFlag.ClearEdges)
+    motion = kind.displacement(row, sight.at, mi.Bool(True))
+    assert np.abs(np.array(motion)).max() == 0
+    speed = dr.dot(n_perp, tangents(motion))
+    expected = np.array(dr.dot(n_perp, mi.Vector3f(SHIFT)) + dr.zeros(mi.Float, COUNT))
+    moving = np.array(dr.gather(mi.Bool, kind.moving(), row) & on.valid & (across > 1e-3))
+    assert moving.any()
+    assert np.abs(np.array(speed) - expected)[moving].max() < 1e-3
+
+
+def moved(value, θ):
+    if "Transform" in type(value).__name__:
+        return mi.Transform4f().translate(mi.Vector3f(SHIFT) * θ) @ dr.detach(value)
+    return dr.ravel(dr.unravel(mi.Point3f, dr.detach(value)) + mi.Vector3f(SHIFT) * θ)
+
+
+def test_rays_pass_beside(found):
+    """The rays of both sides run parallel to the line, on their sides of it."""
+    _, kind = found
+    row, t, rng = rows_of(kind)
+    on, ω = lines(kind, row, t, rng)
+    n_perp, across = on.across(ω)
+    sight = Sight.of(on, row, t, ω, mi.Float(2), n_perp)
+    for which, sign in ((0, -1), (1, 1)):
+        ray = sight.beside(mi.UInt32(which))
+        height = np.array(dr.dot(ray.o - on.x, n_perp))[np.array(on.valid & (across > 1e-4))]
+        assert (np.sign(height) == sign).all()
+        side = kind.side(row, sight, mi.UInt32(which), mi.Bool(True))
+        assert np.array(side.traced | side.pi.valid).all()  # never a silent nothing
+
+
+def test_directions_of_fixed_edges_have_the_density_they_say(found):
+    _, kind = found
+    if not isinstance(kind, FixedKind):
+        assert np.isfinite(np.array(kind.inside(rows_of(kind)[0], mi.Bool(True)))).all()
+        return
+    row, _, rng = rows_of(kind)
+    for use in (Use.STEP, Use.BACKGROUND):
+        w = kind.wedges(row, use, mi.Bool(True))
+        ω, pdf = w.sample(rng.next_2d())
+        drawn = np.array((pdf > 0) & dr.full(mi.Bool, True, COUNT))
+        assert drawn.any()
+        agree = np.isclose(np.array(w.pdf(ω)), np.array(pdf), rtol=1e-3)[drawn]
+        assert agree.mean() > 0.99  # rounding may put a sample on the other side of a wedge's border
