@@ -54,7 +54,8 @@ from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.edges.table import EdgeTable, look_beside
 from psdr_jit.errors import UnsupportedError
 from psdr_jit.interior.term import camera_passes
-from psdr_jit.paths.walk import SHADOW_EPSILON, NoSink, continue_path, first_hit, walk
+from psdr_jit.paths.bounce import PathState, bounce
+from psdr_jit.paths.walk import SHADOW_EPSILON, NoSink, first_hit, walk
 from psdr_jit.plan.job import Job
 from psdr_jit.sampling.distribution import EdgeDistribution, pmf, sample_edge
 from psdr_jit.sampling.rows import WeightedRows
@@ -276,11 +277,10 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
 def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath | None:
     """To the next vertex, by BSDF sampling with roulette; paths that end are left out."""
     rng = pixel_sampler(seed, path.lane, spp)
-    bs, weight = si.bsdf().sample(mi.BSDFContext(), si, rng.next_1d(), rng.next_2d(), True)
-    vertex = mi.UInt32(k - 1)
-    β, η, alive, _ = continue_path(rng, path.β * weight, path.η * bs.eta, vertex, job.options.rr_depth)
-    ray = si.spawn_ray(si.to_world(bs.wo))
-    alive &= bs.pdf > 0
+    state = PathState(mi.UInt32(k - 1), path.β, path.η)
+    onward = bounce(si, si.bsdf(), rng, state, job.limits, mi.BSDFContext(), mi.Bool(True))
+    ray, alive = onward.ray(si), onward.alive
+    β, η = onward.path.β, onward.path.η
     pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=alive)
     following = CameraPath(path.lane, Hit.of(ray, pi), u, dr.zeros(mi.Vector3f, dr.width(u)), β, η, path.wavelengths)
     return compact(following, alive & pi.is_valid())

@@ -8,7 +8,7 @@ the sensor:
 
 ω from x_D to x_S, n_⊥ = ±τ×ω/|τ×ω| turned to the open side, r_B and r_S the distances of x_B and x_S from x_D, v_B the
 edge's material velocity, u_S the emitter point's (the interior term keeps emitter points on their material:
-`interior/sweeps.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is
+`interior/flow.py`), u_D the sliding velocity of the receiver (`sensor_subpath.py`), W the importance at x_D. It is
 the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
@@ -41,7 +41,7 @@ from ..scene.facts import SceneFacts
 from . import segment_motion
 from .light_lines import LightLine, sample_light_lines
 from .segment_motion import BoundarySamples, SecondaryTerm
-from .sensor_subpath import UNLIMITED_VERTICES, recorded_vertices, subpaths
+from .sensor_subpath import UNLIMITED_VERTICES, Receivers, recorded_vertices, subpaths
 
 NAME = "direct"
 
@@ -136,17 +136,9 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:
     """What the segments are worth at the sensor: their subpaths are recorded."""
-    records = subpaths(
-        job,
-        job.frame,
-        Stream.DIRECT_SUBPATH,
-        segment.lane,
-        segment.receiver,
-        segment.wavelengths,
-        segment.value / segment.pdf,
-        -(1 - segment.ratio) * segment.n_perp,
-        longest_subpath(job),
-    )
+    a = -(1 - segment.ratio) * segment.n_perp
+    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value / segment.pdf, a)
+    records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
     return BoundarySamples(
         at=segment.at,
         n_perp=segment.n_perp,

@@ -31,24 +31,15 @@ from ..scene.facts import SceneFacts
 from . import indirect_material, segment_motion
 from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
 from .segment_motion import BoundarySamples, SecondaryTerm
-from .sensor_subpath import SubpathRecords, subpaths
+from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
 NAME = "indirect"
 
 
 def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples:
     """The step of radiance across every edge, at the sensor."""
-    records = subpaths(
-        job,
-        job.frame,
-        Stream.INDIRECT_SUBPATH,
-        view.lane,
-        view.receiver,
-        view.wavelengths,
-        view.value / view.pdf,
-        -view.sight.n_perp,
-        longest_subpath(job),
-    )
+    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.value / view.pdf, -view.sight.n_perp)
+    records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, edges.table, view, records))
     dr.eval(value)
     return BoundarySamples(

@@ -26,7 +26,7 @@ from ..plan.job import Job
 from ..sampling.relevance import SecondaryEdges
 from .edge_lines import EdgeLine, EdgeView, longest_subpath, radiance_by_depth, slots, trace_receivers
 from .segment_motion import BoundarySamples
-from .sensor_subpath import SubpathRecords, subpaths
+from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
 
 @dataclass
@@ -55,17 +55,9 @@ def trace(job: Job, edges: SecondaryEdges, line: EdgeLine) -> Background | None:
 def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
     """What the background is worth at the sensor."""
     v = b.view
-    records = subpaths(
-        job,
-        job.frame,
-        Stream.INDIRECT_SUBPATH,
-        v.lane,
-        v.receiver,
-        v.wavelengths,
-        v.value * (b.sign / v.pdf),
-        -(1 - b.ratio) * v.sight.n_perp,
-        longest_subpath(job),
-    )
+    a = -(1 - b.ratio) * v.sight.n_perp
+    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a)
+    records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)
     return BoundarySamples(

@@ -26,15 +26,27 @@ import mitsuba as mi
 
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
-from ..core.sensor_frame import SensorFrame, look_at
+from ..core.sensor_frame import SensorFrame, View, look_at
 from ..core.streams import Stream, stream_seed
+from ..core.varying import varying
 from ..edges.points import facing
-from ..paths.scattering import UNIFORM_SHARE, sample_scattering
-from ..paths.walk import PathLimits, continue_path
+from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
+from ..paths.scattering import UNIFORM_SHARE
 from ..plan.job import Job
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32
+
+
+@dataclass
+class Receivers:
+    """Where boundary segments end: x_D, lane by lane. Detached."""
+
+    lane: mi.UInt32  # picks the random numbers
+    hit: Hit  # x_D as the end of a ray
+    wavelengths: mi.Color0f
+    value: mi.Spectrum  # of the boundary segment over its density
+    a: mi.Vector3f  # covector on u_D
 
 
 @dataclass
@@ -59,7 +71,7 @@ class SubpathRecords:
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.lanes, self.depth = lanes, depth
-        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
+        self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
         self.data = Connection(
             Hit.made(dr.zeros, size),
@@ -145,32 +157,11 @@ def _connected(records: SubpathRecords) -> mi.Bool:
     return found
 
 
-def subpaths(
-    job: Job,
-    frame: SensorFrame,
-    stream: Stream,
-    lane: mi.UInt32,
-    receiver: Hit,
-    wavelengths: mi.Color0f,
-    value: mi.Spectrum,
-    a: mi.Vector3f,
-    longest: int,
-) -> SubpathRecords:
-    """Walk every receiver x_D back to the sensor, at most `longest` vertices; arguments as of `walk_to_sensor`."""
-    records = SubpathRecords(dr.width(lane), longest)
-    walk_to_sensor(
-        job.scene,
-        lane_sampler(stream_seed(job.seed, stream), lane),
-        frame,
-        mi.Ray3f(receiver.o, receiver.d, 0, wavelengths),
-        receiver.intersection(),
-        value,
-        a,
-        PathLimits(longest, job.options.rr_depth),
-        job.form,
-        records,
-        mi.Bool(True),
-    )
+def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
+    """Walk every receiver x_D back to the sensor, at most `longest` vertices."""
+    records = SubpathRecords(dr.width(receivers.lane), longest)
+    limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE)
+    walk_to_sensor(job, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
     dr.eval(records.data)
     return records
 
@@ -181,87 +172,76 @@ def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
     return mi.Vector3f(n) * dr.select(cos != 0, dr.dot(a, ω) / cos, 0)
 
 
-def _adjoint_correction(si: mi.SurfaceInteraction3f, to_sensor: mi.Vector3f) -> mi.Float:
-    """Shading normals make a BSDF asymmetric: factor for particles [Veach 1997, Eq. 5.19], as in `ptracer`."""
-    out = si.to_local(to_sensor)
-    shading = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, to_sensor)
-    geometric = mi.Frame3f.cos_theta(out) * dr.dot(si.n, si.to_world(si.wi))
-    return dr.select(geometric != 0, dr.abs(shading / geometric), 0)
+@dataclass
+class _AtSensor:
+    """How the sensor sees a vertex, and what a path that ends there would be worth. Detached."""
+
+    view: View
+    aperture: mi.Point2f
+    W: mi.Spectrum  # 0 where it is not seen
+
+
+def _connect(
+    scene: mi.Scene, frame: SensorFrame, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active: mi.Bool
+) -> _AtSensor:
+    """Connect the vertex to the sensor; `value`: of the boundary segment and the path that led here."""
+    aperture = sampler.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
+    view = look_at(frame, si.p, aperture)
+    to_sensor = -view.ω
+    lower, upper = frame.window
+    seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
+    seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
+    f = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(to_sensor), seen)
+    W = value * f * particle_correction(si, to_sensor) / view.J_px
+    seen &= dr.any(W != 0)
+    seen &= ~scene.ray_test(si.spawn_ray_to(view.o), seen)
+    return _AtSensor(view, aperture, dr.select(seen, W, 0))
 
 
 @dr.syntax
-def walk_to_sensor(
-    scene: mi.Scene,
-    sampler,
-    frame: SensorFrame,
-    ray: mi.Ray3f,
-    pi: mi.PreliminaryIntersection3f,
-    value: mi.Spectrum,
-    a: mi.Vector3f,
-    limits: PathLimits,
-    form: str,
-    records: SubpathRecords,
-    active: mi.Bool,
-) -> None:
-    """Trace the sensor subpath of x_D = the hit `pi` of `ray`; fills `records`. Detached.
+def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, records: SubpathRecords) -> None:
+    """Trace the sensor subpaths of the receivers; fills `records`. Detached.
 
-    `value`: of the boundary segment over its density; `a`: covector on u_D. `limits.max_depth`: vertices at most.
-    `form`: one of `options.FORMS`.
+    `limits.max_depth`: vertices at most.
     """
-    max_depth, rr_depth = limits.max_depth, limits.rr_depth
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    ray = mi.Ray3f(ray)
-    pi = mi.PreliminaryIntersection3f(pi)
-    value = mi.Spectrum(value)
-    throughput = mi.Spectrum(1)  # roulette judges the walk, not the segment that it started from
-    a = mi.Vector3f(a)
-    η = mi.Float(1)
-    k = mi.UInt32(0)
-    active = mi.Bool(active)
-    while dr.hint(active, label="psdr.sensor_walk", exclude=[frame]):
+    ctx, frame = mi.BSDFContext(mi.TransportMode.Importance), job.frame
+    ray = mi.Ray3f(receivers.hit.o, receivers.hit.d, 0, receivers.wavelengths)
+    pi = receivers.hit.intersection()
+    value = mi.Spectrum(receivers.value)
+    a = mi.Vector3f(receivers.a)
+    # Vertex 0 is what the segment comes from. Roulette judges the walk alone, not the segment that it started from.
+    path = PathState.start(1)
+    active = mi.Bool(True)
+    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, frame, limits]):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         bsdf = si.bsdf()
-
-        aperture = mi.Point2f(0.5)
-        if dr.hint(frame.kind == "thinlens", mode="scalar"):
-            aperture = sampler.next_2d()
-        view = look_at(frame, si.p, aperture)
-        to_sensor = -view.ω
-        wo = si.to_local(to_sensor)
-        lower, upper = frame.window
-        seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
-        seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
-        f = bsdf.eval(ctx, si, wo, seen) * _adjoint_correction(si, to_sensor)
-        W = value * throughput * f / view.J_px
-        seen &= dr.any(W != 0)
-        shadow = si.spawn_ray_to(view.o)
-        seen &= ~scene.ray_test(shadow, seen)
-        g_connect = deposit(a, si.n, view.ω)
-
-        bs = sample_scattering(ctx, si, bsdf, sampler.next_1d(), sampler.next_2d(), UNIFORM_SHARE, False, active)
-        onward = si.to_world(bs.wo)
-        weight = bs.weight * _adjoint_correction(si, onward)
-        g_continue = mi.Vector3f(a)
-        if dr.hint(form == "spatial", mode="scalar"):
-            g_continue = deposit(a, si.n, -onward)
+        end = _connect(job.scene, frame, sampler, si, bsdf, value * path.β, active)
+        onward = bounce(si, bsdf, sampler, path, limits, ctx, active)
+        following = onward.ray(si)
+        g_connect = deposit(a, si.n, end.view.ω)
+        g_continue = _carried_off(job.form, a, si.n, -following.d)
         records.write(
-            k,
+            path.k - 1,
             Connection(
                 Hit.of(ray, pi),
                 g_connect,
                 g_continue,
                 a - g_connect,
-                view.p,
-                view.film,
-                aperture,
-                dr.select(seen, W, 0),
+                end.view.p,
+                end.view.film,
+                end.aperture,
+                end.W,
             ),
             active,
         )
-        throughput, η, alive, _inv = continue_path(sampler, throughput * weight, η * bs.η, k + 1, rr_depth)
         a -= g_continue
-        k += 1
-        active &= alive & (k < max_depth)
-        ray = si.spawn_ray(onward)
-        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        path = onward.path
+        ray = following
+        active = onward.alive & (path.k <= limits.max_depth)
+        pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= pi.is_valid()
+
+
+def _carried_off(form: str, a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
+    """What a vertex keeps of the covector if the path goes on: in the material form all of it, it does not slide."""
+    return deposit(a, n, ω) if form == "spatial" else mi.Vector3f(a)

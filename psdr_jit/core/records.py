@@ -58,7 +58,7 @@ class Hit:
 
 @dataclass
 class EmitterSample:
-    """One next-event estimate: which emitter, where on it, and what the estimate is divided by. Detached."""
+    """One next-event estimate: which emitter, where on it, and how likely. Detached."""
 
     emitter: mi.UInt32  # registry index, 0: none sampled, or occluded
     shape: mi.UInt32  # where the shadow ray ended: shape (0 unless an area light) ...
@@ -66,11 +66,53 @@ class EmitterSample:
     prim_uv: mi.Point2f  # ... and position on it
     d: mi.Vector3f  # unit direction from the vertex to the emitter
     t: mi.Float  # distance [m]
-    weight: mi.Float  # MIS / pdf; pdf in 1/sr, or the emitter's pmf if it is delta
+    pdf: mi.Float  # per solid angle [1/sr]; of a delta emitter, the probability of choosing it
+    mis: mi.Float  # weight against BSDF sampling
+    delta: mi.Bool  # a point or a single direction
+
+    @staticmethod
+    def made(make, size: int) -> EmitterSample:
+        """`size` samples by `make`, see `Hit.made`."""
+        return EmitterSample(
+            emitter=make(mi.UInt32, size),
+            shape=make(mi.UInt32, size),
+            prim_index=make(mi.UInt32, size),
+            prim_uv=make(mi.Point2f, size),
+            d=make(mi.Vector3f, size),
+            t=make(mi.Float, size),
+            pdf=make(mi.Float, size),
+            mis=make(mi.Float, size),
+            delta=make(mi.Bool, size),
+        )
 
     def hit(self, o: mi.Point3f) -> Hit:
         """The shadow ray as if it had started at the vertex `o` itself."""
         return Hit(o, self.d, self.t, self.shape, self.prim_index, self.prim_uv)
+
+    def mis_over_pdf(self) -> mi.Float:
+        """Factor of the estimate, 0 where there is none. Masked here: a derivative of 0 times infinity is none."""
+        return dr.select(self.emitter != 0, self.mis / self.pdf, 0)
+
+
+@dataclass
+class Continuation:
+    """How likely a path was to go on as it did. Detached."""
+
+    pdf: mi.Float  # of the direction, per solid angle [1/sr]; of a delta lobe, its probability; 0: the path ended
+    survival: mi.Float  # probability that the roulette lets it live
+    delta: mi.Bool  # a delta lobe
+
+    @staticmethod
+    def made(make, size: int) -> Continuation:
+        """`size` of them by `make`, see `Hit.made`."""
+        return Continuation(make(mi.Float, size), make(mi.Float, size), make(mi.Bool, size))
+
+    def goes_on(self) -> mi.Bool:
+        return self.pdf > 0
+
+    def inv_pdf(self) -> mi.Float:
+        """1 / (pdf · survival), 0 where the path ended."""
+        return dr.select(self.goes_on(), dr.rcp(self.survival) / self.pdf, 0)
 
 
 @dataclass
@@ -81,7 +123,18 @@ class Vertex:
     β: mi.Spectrum  # throughput before this vertex
     weight_emission: mi.Float  # MIS weight of the emission met here by BSDF sampling
     nee: EmitterSample
-    inv_pdf: mi.Float  # 1/(pdf · roulette) of the continuation, 0 where the path ended, negated for a delta lobe
+    onward: Continuation
+
+    @staticmethod
+    def made(make, size: int) -> Vertex:
+        """`size` vertices by `make`, see `Hit.made`."""
+        return Vertex(
+            hit=Hit.made(make, size),
+            β=make(mi.Spectrum, size),
+            weight_emission=make(mi.Float, size),
+            nee=EmitterSample.made(make, size),
+            onward=Continuation.made(make, size),
+        )
 
 
 @dataclass

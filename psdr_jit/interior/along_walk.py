@@ -5,7 +5,7 @@ a path is
 
     dL = Σ_k [ β̇_k L_k + β_k (L̇_e,k + ḟ_k(ω_em) L_em + f_k(ω_em) L̇_em) ],      β̇_{k+1} = β̇_k w_k + β_k ḟ_k(ω_{k+1}) / p
 
-with L_k what vertex k emits and scatters from an emitter sample ω_em. It is `sweeps.forward_sweep` of these scenes.
+with L_k what vertex k emits and scatters from an emitter sample ω_em. It is `sweeps.forward_sweep` of the resting flow.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.ad import tangents
-from ..paths.walk import NoSink, Scatter
+from ..paths.sink import NoSink, Scatter
 
 
 @dataclass
@@ -33,17 +33,19 @@ class MaterialTangents(NoSink):
     def scattered(self, k: mi.UInt32, s: Scatter, active: mi.Bool) -> None:
         """Add what vertex `k` contributes, and carry the throughput's derivative on."""
         ctx = mi.BSDFContext()
-        smooth = s.goes_on & ~s.delta
+        nee, onward = s.nee, s.onward
+        smooth = onward.alive & ~onward.scattering.delta
         with dr.resume_grad():
-            f_em = s.bsdf.eval(ctx, s.si, s.ω_em, s.sees_emitter)
-            f = s.bsdf.eval(ctx, s.si, s.wo, smooth)
+            f_em = s.bsdf.eval(ctx, s.si, nee.ω, nee.seen)
+            f = s.bsdf.eval(ctx, s.si, onward.scattering.wo, smooth)
             f_em_grad, f_grad = tangents(f_em, f)
-        from_emitter = s.mis_em * s.value_em
-        L = s.emission + dr.select(s.sees_emitter, dr.detach(f_em) * from_emitter, 0)
-        own = dr.select(s.sees_emitter, f_em_grad * from_emitter, 0) + self._from_lights(s, dr.detach(f_em))
+        from_emitter = nee.mis * nee.value
+        L = s.met.mis * s.met.value + dr.select(nee.seen, dr.detach(f_em) * from_emitter, 0)
+        own = dr.select(nee.seen, f_em_grad * from_emitter, 0) + self._from_lights(s, dr.detach(f_em))
         self.dL += dr.select(active, self.β_grad * L + s.β * own, 0)
-        β_grad = self.β_grad * s.weight + dr.select(smooth, s.β * f_grad * s.inv_pdf, 0)
-        self.β_grad = dr.select(active, β_grad, self.β_grad)
+        weight = onward.scattering.weight / onward.survival
+        β_grad = self.β_grad * weight + dr.select(smooth, s.β * f_grad * onward.likelihood().inv_pdf(), 0)
+        self.β_grad = dr.select(active & onward.alive, β_grad, self.β_grad)
 
     def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:
         """What the vertex sends back because lights change."""
@@ -55,20 +57,21 @@ class RadianceTangents(MaterialTangents):
     """The same where emission depends on θ as well."""
 
     def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:
-        emits = s.weight_emission > 0
+        emits = s.met.mis > 0
+        nee = s.nee
         with dr.resume_grad():
-            met_grad, sampled_grad = tangents(s.emitter.eval(s.si, emits), _radiance(s))
-        direct = dr.select(s.sees_emitter & (s.ds.pdf > 0), f_em * sampled_grad * s.mis_em / s.ds.pdf, 0)
-        return dr.select(emits, s.weight_emission * met_grad, 0) + direct
+            met_grad, sampled_grad = tangents(s.met.emitter.eval(s.si, emits), _radiance(s))
+        direct = dr.select(nee.seen & (nee.ds.pdf > 0), f_em * sampled_grad * nee.mis / nee.ds.pdf, 0)
+        return dr.select(emits, s.met.mis * met_grad, 0) + direct
 
 
 def _radiance(s: Scatter) -> mi.Spectrum:
     """What the emitter sample sends, attached: `eval`, which all lights have, and for delta ones their own sampling."""
-    emitter, ds = s.ds.emitter, s.ds
+    ds, seen = s.nee.ds, s.nee.seen
     source = mi.SurfaceInteraction3f(ds, s.si.wavelengths)
-    infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+    infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
     source.wi = dr.select(infinite, -ds.d, source.to_local(-ds.d))
-    delta = s.sees_emitter & mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
-    value = emitter.eval(source, s.sees_emitter & ~delta)
-    _, of_delta = emitter.sample_direction(s.si, mi.Point2f(0.5), delta)
+    delta = seen & ds.delta
+    value = ds.emitter.eval(source, seen & ~delta)
+    _, of_delta = ds.emitter.sample_direction(s.si, mi.Point2f(0.5), delta)
     return dr.select(delta, of_delta, value)

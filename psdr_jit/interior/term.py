@@ -1,4 +1,4 @@
-"""The interior term as an image: camera rays → recorded paths → sweep → film (estimator: `sweeps.py`).
+"""The interior term as an image: camera rays → recorded paths → sweep → film (estimator: `sweeps.py`, `flow.py`).
 
 Only paths that touch something differentiable have a derivative. When neither camera nor emitters are attached,
 a cheap first walk without shadow rays finds those paths and only they are recorded; the rest contribute exactly 0.
@@ -30,7 +30,14 @@ from ..plan.reasons import what_changes
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from .along_walk import MaterialTangents, RadianceTangents
-from .sweeps import SceneTraits, backward_sweep, forward_sweep
+from .flow import Flow, SceneTraits
+from .material import MaterialFlow
+from .resting import RestingFlow
+from .spatial import SpatialFlow
+from .sweeps import backward_sweep, forward_sweep
+
+#: What vertices do from the second on, by form: slide along their rays, or stay on their material.
+FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow}
 
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
@@ -153,11 +160,12 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
     return records, lane
 
 
-def _traits(job: Job) -> SceneTraits:
+def flow_of(job: Job) -> Flow:
+    """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
-    delta_lobes = any(s.delta_lobes for s in facts.shapes)
+    traits = SceneTraits(facts.has_delta_emitters, any(s.delta_lobes for s in facts.shapes))
     moves = facts.geometry_moves or not job.plan.prunes
-    return SceneTraits(facts.has_delta_emitters, delta_lobes, moves, job.form)
+    return (FLOWS[job.form] if moves else RestingFlow)(job.scene, traits)
 
 
 def _skipped(job: Job, p: CameraPass, records: PathRecords) -> mi.Float:
@@ -179,7 +187,7 @@ def _derivatives(job: Job, p: CameraPass) -> mi.Spectrum:
         if job.facts.camera_moves:
             o_grad, d_grad = job.motion.camera_tangents(p.ray)
             o_grad = o_grad + _skipped(job, p, records) * d_grad
-        recorded = forward_sweep(job.scene, records, o_grad, d_grad, _traits(job), job.motion)
+        recorded = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
         dr.scatter(dL, job.call.counters.rejected.keep_finite(recorded), lane)
         dr.eval(dL)  # the splat reads it inside a recorded loop, where pending writes are not seen
     return dL
@@ -204,7 +212,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 continue
             δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
             δL = dr.gather(mi.Spectrum, δL, lane)
-            λ_o, λ_d = backward_sweep(job.scene, records, δL, _traits(job), job.motion)
+            λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
             if job.facts.camera_moves:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
                 with dr.resume_grad():

@@ -1,18 +1,20 @@
 """Walks that only look: which paths meet something differentiable, and how long do paths get?
 
-They draw the same random numbers in the same order as `walk.walk`, so they follow the same paths.
+They go by the same steps (`bounce.py`) with the same random numbers as `walk.walk`, so they follow the same paths,
+without emitters and shadow rays.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
-from .scattering import sample_scattering
-from .walk import PathLimits, continue_path, first_hit, interaction
+from .bounce import PathLimits, PathState, bounce
+from .rays import first_hit, interaction
 
 
-@dr.syntax
 def touches(
     scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool, table: mi.UInt32
 ) -> mi.Bool:
@@ -20,50 +22,43 @@ def touches(
 
     The last vertex only emits, and emitters are not in question here, so its ray is never traced.
     """
-    # a frozen dataclass cannot be loop state
-    max_depth, rr_depth, end_black = limits.max_depth, limits.rr_depth, limits.end_black
-    share, refuses, own_frames = limits.uniform_share, limits.refuses, limits.own_frames
-    ray, pi, _emission = first_hit(scene, ray, hide_emitters)
-    found = mi.Bool(False)
-    β = mi.Spectrum(1)
-    η = mi.Float(1)
-    k = mi.UInt32(0)
-    active = pi.is_valid() & (k + 1 < max_depth)
-    while dr.hint(active, label="psdr.touches"):
-        found |= dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, pi.shape), active) != 0
-        si = interaction(pi, ray, own_frames)
-        sampler.next_2d()  # spent on emitter sampling in `walk`
-        u_lobe, u = sampler.next_1d(), sampler.next_2d()
-        bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), u_lobe, u, share, refuses, active)
-        β, η, alive, _weight = continue_path(sampler, β * bs.weight, η * bs.η, k, rr_depth, end_black)
-        alive &= bs.pdf > 0
-        k += 1
-        active = alive & ~found & (k + 1 < max_depth)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        active &= pi.is_valid()
+
+    def stop(pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+        return dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, pi.shape), active) != 0
+
+    found, _ = _follow(scene, sampler, ray, limits, hide_emitters, stop)
     return found
 
 
-@dr.syntax
 def count_vertices(scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool) -> int:
-    """Largest number of vertices among the paths that `walk` would trace (evaluates; unlimited depth only)."""
-    rr_depth, end_black, share = limits.rr_depth, limits.end_black, limits.uniform_share
-    refuses, own_frames = limits.refuses, limits.own_frames
+    """No path that `walk` would trace has more vertices than this, and one may have as many (evaluates)."""
+    _, scattered = _follow(scene, sampler, ray, limits, hide_emitters, lambda pi, active: mi.Bool(False))
+    return int(dr.max(scattered)[0]) + 1
+
+
+@dr.syntax
+def _follow(
+    scene: mi.Scene,
+    sampler,
+    ray: mi.Ray3f,
+    limits: PathLimits,
+    hide_emitters: bool,
+    stop: Callable[[mi.PreliminaryIntersection3f, mi.Bool], mi.Bool],
+) -> tuple[mi.Bool, mi.UInt32]:
+    """Follow the paths until `stop` has seen enough: `(stopped, number of vertices at which the path scattered)`."""
     ray, pi, _emission = first_hit(scene, ray, hide_emitters)
-    β = mi.Spectrum(1)
-    η = mi.Float(1)
-    k = mi.UInt32(0)
-    active = pi.is_valid()
-    while dr.hint(active, label="psdr.count_vertices"):
-        si = interaction(pi, ray, own_frames)
-        sampler.next_2d()
-        u_lobe, u = sampler.next_1d(), sampler.next_2d()
-        bs = sample_scattering(mi.BSDFContext(), si, si.bsdf(), u_lobe, u, share, refuses, active)
-        β, η, active, _weight = continue_path(sampler, β * bs.weight, η * bs.η, k, rr_depth, end_black)
-        active &= bs.pdf > 0
-        k += 1
-        ray = si.spawn_ray(si.to_world(bs.wo))
+    ctx = mi.BSDFContext()
+    path = PathState.start()
+    stopped = mi.Bool(False)
+    active = pi.is_valid() & (path.k + 1 < limits.max_depth)
+    while dr.hint(active, label="psdr.dry_walk", exclude=[limits]):
+        stopped |= stop(pi, active)
+        si = interaction(pi, ray, limits.own_frames)
+        sampler.next_2d()  # spent on emitter sampling in `walk`
+        onward = bounce(si, si.bsdf(), sampler, path, limits, ctx, active)
+        path = onward.path
+        ray = onward.ray(si)
+        active = onward.alive & ~stopped & (path.k + 1 < limits.max_depth)
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= pi.is_valid()
-    return int(dr.max(k)[0]) + 1
+    return stopped, path.k

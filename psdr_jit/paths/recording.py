@@ -5,55 +5,46 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.records import Arrival, EmitterSample, Hit, Vertex
-from .walk import NoSink, shadow_hit
+from ..core.records import Arrival, Hit, Vertex
+from ..core.varying import varying
+from .rays import shadow_hit
+from .sink import NoSink, Scatter, Sink
 
 #: Cosine of arrival below which a vertex has no derivative. A sliding vertex moves by 1/cosθ, and at the outline of a
 #: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
 GRAZING = 5e-4
 
 
-class PathRecords:
+class PathRecords(Sink):
     """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
 
     A plain class on purpose: Dr.Jit must not take the buffers for loop state. Costs `BYTES_RGB` per vertex.
     """
 
-    BYTES_RGB = 4 * (11 + 3 + 1 + 10 + 1)
-
-    connect = staticmethod(shadow_hit)
+    BYTES_RGB = 4 * (11 + 3 + 1 + 11 + 2) + 2
 
     def __init__(self, lanes: int, depth: int):
-        size = lanes * depth
         self.lanes, self.depth = lanes, depth
-        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
+        self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
         self.whole = dr.full(mi.UInt32, 0xFFFFFFFF, lanes)  # vertices before the first that is met edge-on
         dr.make_opaque(self.whole)
         self.wavelengths = mi.Color0f()  # per lane, likewise (empty in RGB)
-        self.vertices = Vertex(
-            hit=Hit.made(dr.empty, size),
-            β=dr.empty(mi.Spectrum, size),
-            weight_emission=dr.empty(mi.Float, size),
-            nee=EmitterSample(
-                emitter=dr.empty(mi.UInt32, size),
-                shape=dr.empty(mi.UInt32, size),
-                prim_index=dr.empty(mi.UInt32, size),
-                prim_uv=dr.empty(mi.Point2f, size),
-                d=dr.empty(mi.Vector3f, size),
-                t=dr.empty(mi.Float, size),
-                weight=dr.empty(mi.Float, size),
-            ),
-            inv_pdf=dr.empty(mi.Float, size),
-        )
+        self.vertices = Vertex.made(dr.empty, lanes * depth)
 
     def radiance(self, k: mi.UInt32, L: mi.Spectrum, active: mi.Bool) -> None:
         """Not needed: the sweeps add up radiance themselves."""
 
-    def scattered(self, k: mi.UInt32, scatter, active: mi.Bool) -> None:
-        """End the record before a vertex that is met edge-on: how it slides cannot be told in single precision."""
-        edge_on = active & scatter.si.is_valid() & (dr.abs(dr.dot(scatter.si.n, scatter.arrival)) < GRAZING)
+    def connect(self, scene, si, ds, active) -> tuple[Hit, mi.Bool]:
+        return shadow_hit(scene, si, ds, active)
+
+    def scattered(self, k: mi.UInt32, scatter: Scatter, active: mi.Bool) -> None:
+        """Store the vertex. Where it is met edge-on the record ends: how it slides, single precision cannot tell."""
+        index = k * self.stride + self.lane
+        dr.scatter(self.vertices, scatter.record(), index, active, mode=dr.ReduceMode.Permute)
+        si, arrival = scatter.si, scatter.hit.d
+        edge_on = active & si.is_valid() & (dr.abs(dr.dot(si.n, arrival)) < GRAZING)
         # every lane has its own entry; any other mode would compile a kernel for every number of lanes
         mode = dr.ReduceMode.NoConflicts
         dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on, mode=mode)
@@ -63,10 +54,6 @@ class PathRecords:
         short = self.whole < self.count
         self.count = dr.minimum(self.count, self.whole)
         return short
-
-    def write(self, k: mi.UInt32, vertex: Vertex, active: mi.Bool) -> None:
-        """Store vertex `k` of the active lanes (the sink interface of `walk.walk`)."""
-        dr.scatter(self.vertices, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
     def vertex(self, k: mi.UInt32, active: mi.Bool) -> Vertex:
         """Vertex `k` of every lane; zero where inactive."""
@@ -88,7 +75,7 @@ class RadianceByDepth(NoSink):
 
     def __init__(self, lanes: int, depth: int):
         self.lanes, self.depth = lanes, depth
-        self.stride = dr.opaque(mi.UInt32, lanes)  # a literal would compile new kernels for every lane count
+        self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
         self.values = dr.zeros(mi.Spectrum, lanes * depth)
         self.reached = dr.zeros(mi.UInt32, lanes)  # entries written, per lane

@@ -38,6 +38,18 @@ def mixture_pdf(si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, pdf_bsdf: mi.Float, share
     return share * uniform + (1 - share) * pdf_bsdf
 
 
+def reverse_pdf(ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, share: float, active: mi.Bool) -> mi.Float:
+    """Density of the same turn taken the other way: arriving from `wo` (local), `sample_scattering` goes to `si.wi`.
+
+    Per solid angle at the vertex, in the transport mode opposite to that of `ctx`; delta lobes have none: 0.
+    """
+    radiance, importance = mi.TransportMode.Radiance, mi.TransportMode.Importance
+    opposite = mi.BSDFContext(radiance if ctx.mode == importance else importance)
+    turned = mi.SurfaceInteraction3f(si)
+    turned.wi = mi.Vector3f(wo)
+    return mixture_pdf(turned, bsdf, si.wi, bsdf.pdf(opposite, turned, si.wi, active), share)
+
+
 def _share(bsdf: mi.BSDFPtr, share: float) -> mi.Float:
     """Delta lobes keep pure BSDF sampling: their probability is not a density."""
     return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta), 0, share)

@@ -161,7 +161,7 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
-    """The sweeps take the weight and the direction of a delta lobe for constants (see `sweeps.vertex_terms`)."""
+    """The sweeps take the weight and the direction of a delta lobe for constants (see `interior.flow`)."""
     for shape in facts.shapes:  # moving geometry, which attaches the normals too, is refused by `check_specular`
         watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
         steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]

@@ -1,0 +1,137 @@
+"""How the vertices of a path move while θ changes: the contract of a flow, and what several flows share.
+
+Vertex k sends back to its predecessor
+
+    Lo_k = L_k + w_k · Lo_{k+1}
+
+and hands on an attached point x_k and direction d_k, from which vertex k+1 is reached. A flow decides what x_k and d_k
+do: slide along the ray (`spatial.py`), stay on the material (`material.py`), or nothing at all (`resting.py`). The
+sweeps carry the derivatives of both, and know nothing else about it.
+
+Where a direction was drawn from a smooth density, its d_k is a constant: the flow keeps the sample. At a specular
+vertex d_k would follow from the arrival, and the same sweeps then carry it.
+
+Emission is in *material* form wherever geometry moves, whether the emitter point y was found by emitter or by BSDF
+sampling (both MIS partners estimate one integral, so they must move y alike):
+
+    f(ω_y) · L_e(y→x_k) · G(x_k, y) |dA(y)/dA_0| / p
+
+An area light's outline then is no discontinuity of this term. Infinitely distant emitters keep the direction, delta
+emitters follow their own attached pose.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Arrival, EmitterSample, Hit, Vertex
+from ..paths.recording import GRAZING
+from ..plan.motion import Displacements
+
+
+@dataclass
+class VertexTerms:
+    """Attached terms of one vertex (see the module's equations)."""
+
+    x: mi.Point3f  # the vertex
+    d: mi.Vector3f  # direction in which the next one is reached
+    L: mi.Spectrum  # direct light scattered at x (both MIS partners), plus emission if it is the first vertex
+    w: mi.Spectrum  # factor on what arrives from the next vertex
+
+
+@dataclass(frozen=True)
+class SceneTraits:
+    """Which code paths a scene needs at all (fixed while tracing)."""
+
+    delta_emitters: bool
+    delta_lobes: bool  # only together with static geometry, see `scene.checks`
+
+
+class Flow(ABC):
+    """Host object of a job: the terms of a vertex as a function of how it is reached."""
+
+    @abstractmethod
+    def terms(
+        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
+    ) -> VertexTerms:
+        """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads.
+
+        `first`: lanes whose vertex is the first of its path. Called where displacements are attached.
+        """
+
+
+def material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool):
+    """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
+
+    `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
+    direction stays as it is.
+    """
+    ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    moves.follow(si, hit)
+    on_surface = active & si.is_valid()
+    offset = si.p - x
+    dist2 = dr.squared_norm(offset)
+    ω = mi.Vector3f(hit.d)
+    ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
+    area = _area_element(si, on_surface)
+    cos = dr.abs_dot(si.n, ω)
+    # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
+    usable = on_surface & (cos > GRAZING) & (area > 0)
+    measure = dr.select(usable, cos / dist2 * area, 1)
+    return si, ω, dr.relative_grad(measure)
+
+
+def emission_towards(
+    x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, moves: Displacements, active: mi.Bool
+):
+    """Emission of the material point `hit` towards the attached point `x`: `(ω, L_e · measure)`, both attached."""
+    si, ω, measure = material_segment(x, hit, wavelengths, moves, active)
+    return ω, emitter.eval(si, active) * measure
+
+
+def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+    """|dA| of a material point up to a constant factor, attached.
+
+    Meshes: area of the triangle. Their dp_du, dp_dv will not do: a degenerate texture map
+    replaces them by a unit frame.
+    """
+    area = dr.norm(dr.cross(si.dp_du, si.dp_dv))
+    on_mesh = active & si.shape.is_mesh()
+    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, dr.reinterpret_array(mi.UInt32, si.shape), 0))
+    corners = mesh.face_indices(si.prim_index, on_mesh)
+    p0, p1, p2 = (mesh.vertex_position(corners[i], on_mesh) for i in range(3))
+    return dr.select(on_mesh, dr.norm(dr.cross(p1 - p0, p2 - p0)), area)
+
+
+def next_event(
+    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, nee: EmitterSample, traits: SceneTraits, moves: Displacements
+) -> mi.Spectrum:
+    """Scattered emitter sample, attached: f(ω) · value · MIS / pdf."""
+    active = nee.emitter != 0
+    emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
+    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, moves, active)
+    if traits.delta_emitters:
+        is_delta = active & nee.delta
+        seen = mi.SurfaceInteraction3f(si)
+        seen.p = seen.p - moves.of_lights()
+        ds, value_delta = emitter.sample_direction(seen, mi.Point2f(0.5), is_delta)
+        ω = dr.select(is_delta, ds.d, ω)
+        value = dr.select(is_delta, value_delta, value)
+    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
+    return dr.select(active, f * value * nee.mis_over_pdf(), 0)
+
+
+def emitter_behind(scene: mi.Scene, following: Arrival, si, active: mi.Bool) -> tuple[mi.EmitterPtr, mi.Bool]:
+    """The emitter where the sampled direction leads, `si` or the sky, and the lanes in which its emission counts."""
+    emitter = dr.select(si.is_valid(), si.shape.emitter(), scene.environment())
+    return emitter, active & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
+
+
+def throughput_ratio(vertex: Vertex, following: Arrival) -> mi.Spectrum:
+    """Weight of a delta lobe, which has no value to evaluate: a constant here."""
+    return dr.select(vertex.β != 0, following.β / vertex.β, 0)

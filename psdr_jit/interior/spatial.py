@@ -1,0 +1,49 @@
+"""The *spatial* flow: directions stay fixed, and every vertex slides along the ray that reaches it.
+
+    u_{k+1} = u_k − ω_k · n·(u_k − v_{k+1}) / (n·ω_k)                                    (motion transport)
+
+with v the material velocity of the surface and u_1 given by the attached camera ray. This is the "original"
+parameterisation of [Zhang et al. 2020, §4, Eq. 14-17]; differentiating Mitsuba's ray-triangle intersection with an
+attached origin produces exactly this recursion. The factor of the continuation is w_k = f(ω_{k+1}) / p. The visibility
+discontinuities of this flow are left to the boundary terms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Arrival, Vertex
+from ..plan.motion import Displacements
+from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event, throughput_ratio
+
+
+@dataclass(frozen=True)
+class SpatialFlow(Flow):
+    """See the module."""
+
+    scene: mi.Scene
+    traits: SceneTraits
+
+    def terms(
+        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
+    ) -> VertexTerms:
+        ctx = mi.BSDFContext()
+        si = moves.surface(vertex.hit, ray, mi.RayFlags.All)
+        bsdf = si.bsdf()
+        L = dr.select(first, vertex.weight_emission * si.emitter(self.scene).eval(si, first), 0)
+        L += next_event(si, bsdf, vertex.nee, self.traits, moves)
+
+        goes_on, inv_pdf = vertex.onward.goes_on(), vertex.onward.inv_pdf()
+        w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * inv_pdf
+
+        emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
+        ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
+        w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
+        if self.traits.delta_lobes:
+            is_delta, ratio = vertex.onward.delta, throughput_ratio(vertex, following)
+            w, w_emission = dr.select(is_delta, ratio, w), dr.select(is_delta, ratio, w_emission)
+        L += dr.select(emits, w_emission * value * following.weight_emission, 0)
+        return VertexTerms(si.p, following.hit.d, L, w)

@@ -1,0 +1,70 @@
+"""What a ray meets: first hits of camera rays, shadow rays, and the surface at the end of a ray."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Hit
+
+#: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
+SHADOW_EPSILON = 1e-3
+
+
+def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
+    """Is the emitter sample visible from `si`? Any-hit ray; returns `(hit, visible)` with an empty hit."""
+    occluded = scene.ray_test(si.spawn_ray_to(ds.p), active)
+    return Hit.made(dr.zeros, 1), active & ~occluded
+
+
+def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
+    """The same with a closest-hit ray, which also tells *which* point of an area light was reached.
+
+    With it the light's own motion can be attached later without another ray. Returns `(hit, visible)`.
+    """
+    ray = si.spawn_ray_to(ds.p)
+    on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
+    ray.maxt = dr.select(on_surface, ds.dist * (1 + SHADOW_EPSILON), ray.maxt)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    reached = pi.is_valid() & (pi.t >= ds.dist * (1 - SHADOW_EPSILON)) & (pi.shape.emitter() == ds.emitter)
+    return Hit.of(ray, pi), active & dr.select(on_surface, reached, ~pi.is_valid())
+
+
+@dr.syntax
+def skip_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f):
+    """Pass straight through area emitters: the ray restarted behind the last one, and what it meets."""
+    ray = mi.Ray3f(ray)
+    pi = mi.PreliminaryIntersection3f(pi)
+    active = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array comparison)
+    while dr.hint(active, label="psdr.skip_emitters"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+        rest = ray.maxt - pi.t
+        ray = si.spawn_ray(ray.d)
+        ray.maxt = rest
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    return ray, pi
+
+
+def first_hit(scene: mi.Scene, ray: mi.Ray3f, hide_emitters: bool):
+    """First vertex seen by a camera ray: `(ray, pi, emission)`, `emission` = lanes that count what it emits."""
+    pi = scene.ray_intersect_preliminary(ray, coherent=True)
+    if not hide_emitters:
+        return ray, pi, mi.Bool(True)
+    ray, pi = skip_emitters(scene, ray, pi)
+    return ray, pi, mi.Bool(False)
+
+
+def interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, own_frames: bool) -> mi.SurfaceInteraction3f:
+    """The surface that `ray` meets. Unless `own_frames`, its shading frame depends on the normal alone.
+
+    Mitsuba takes the tangents of a mesh without texture coordinates from the first side of each triangle: with equal
+    random numbers, a path would go on in another direction from the next triangle of the same plane, and the difference
+    of radiance across their edge, which is nearly 0, would be noise.
+    """
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    if own_frames:
+        return si
+    si.sh_frame = mi.Frame3f(si.sh_frame.n)
+    si.wi = dr.select(si.is_valid(), si.to_local(-ray.d), si.wi)
+    return si
