@@ -16,6 +16,7 @@ import numpy as np
 
 from psdr_jit.core.compat import pack_positions
 from psdr_jit.core.upload import uploaded
+from psdr_jit.core.varying import varying
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.scene.params import find_param, is_transform
 
@@ -169,7 +170,7 @@ class Pose:
         if self.pivot is not None:
             self._pivot = mi.Point3f(*broadcast(self.pivot, (3,), f"the pivot of '{self.parameter}'").tolist())
         dr.make_opaque(self._pivot)
-        return {name: dr.opaque(mi.Vector3f, 0) for name in self.learning_rates}
+        return {name: varying(mi.Vector3f, 0) for name in self.learning_rates}
 
     def start(self, latents: dict[str, Any], rng: np.random.Generator | None) -> dict[str, Any]:
         found = {}
