@@ -24,7 +24,7 @@ class Problem:
     index: int | None = None
     load: dict = field(default_factory=dict)  # overrides of the scene file's <default> values
     options: dict = field(default_factory=dict)  # of the integrators on both sides
-    slow: bool = False  # finite differences of it take long: not in the default suite
+    slow: bool = False  # not in the default suite: takes long, or other problems there have its terms and shapes
     tag: str = ""  # tells apart problems of one scene and parameter
 
     @property
@@ -52,7 +52,7 @@ PROBLEMS = (
     Problem("coloured_emitter", "card.vertex_color", 0.01),
     Problem("coloured_emitter", "card.vertex_positions", 0.004, direction=X, slow=True),
     Problem("emitter_sphere", "bulb.to_world", 0.005, direction=X, slow=True),
-    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=Y),
+    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=Y, slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, direction=Y, slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, rotate=(1, 1, 0), slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, index=1, tag="stretch", slow=True),
@@ -95,7 +95,7 @@ PROBLEMS = (
         "camera_crop", "camera.principal_point_offset_x", 0.0005,
         load={"rfilter": "gaussian", "sample_border": "true"}, tag="gaussian-border", slow=True,
     ),  # fmt: skip
-    Problem("camera_orthographic_scaled", "camera.to_world", 0.005, direction=X),
+    Problem("camera_orthographic_scaled", "camera.to_world", 0.005, direction=X, slow=True),
     # materials
     Problem("sliding_texture", "floor.bsdf.reflectance.data", 0.01),
     Problem("rough_conductor", "ball.bsdf.alpha.value", 0.004),
@@ -110,7 +110,7 @@ PROBLEMS = (
     Problem("concave_corner", "camera.to_world", 0.002, direction=X),
     Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y),
     Problem("three_sheets", "camera.to_world", 0.002, direction=X),
-    Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z),
+    Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z, slow=True),
     # shadows, and what surfaces see of each other
     Problem("area_shadow", "blocker.vertex_positions", 0.004, direction=X),
     Problem("area_shadow", "light.to_world", 0.01, direction=X),
@@ -123,15 +123,15 @@ PROBLEMS = (
     Problem("directional_shadow", "sun.to_world", 0.002, rotate=Z),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
-    Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X),
-    Problem("tube_shadow", "blocker.to_world", 0.004, direction=X),
+    Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X, slow=True),
+    Problem("tube_shadow", "blocker.to_world", 0.004, direction=X, slow=True),
     Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X),
     Problem("constant_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
     Problem("faceted_ball", "blocker.vertex_positions", 0.004, rotate=(1, 1, 0), slow=True),
-    Problem("faceted_ball", "blocker.vertex_positions", 0.004, direction=X),
+    Problem("faceted_ball", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("smooth_ball_shadow", "blocker.vertex_positions", 0.005, direction=X, slow=True),
-    Problem("glossy_floor", "blocker.vertex_positions", 0.005, direction=X),
+    Problem("glossy_floor", "blocker.vertex_positions", 0.005, direction=X, slow=True),
     Problem("baffled_light", "blocker.vertex_positions", 0.005, direction=X, slow=True),
     Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3}),
     # leaves and boxes about a pixel wide: a larger step would take their corners across the borders of pixels

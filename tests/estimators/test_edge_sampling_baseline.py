@@ -73,12 +73,18 @@ CASES = (
 )
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: c.why)
+SLOW = ("points of the light move",)
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=c.why, marks=pytest.mark.slow if c.why in SLOW else ()) for c in CASES]
+)
 def test_first_vertex(llvm, case):
     motion = motion_of(case.scene, case.param)
     assert_agree(secondary(motion, 2, case.seeds), reference(motion, 2))
 
 
+@pytest.mark.slow
 def test_third_segment(llvm, monkeypatch):
     """Alone: reflected light that an edge hides, and shadows seen by way of another surface."""
 
