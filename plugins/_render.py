@@ -10,7 +10,6 @@ from psdr_jit.core import film as films
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
-from psdr_jit.derivative.integrator_specs import require_samples
 from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import ParameterError
@@ -44,7 +43,7 @@ class TermIntegrator(ADIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         require_integrator(self)
         view = find_sensor(scene, sensor)
-        require_samples(view, spp)
+        films.require_samples(view, spp)
         if not splits(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)

@@ -34,10 +34,11 @@ INDEPENDENT = {("interior", "boundary"), ("boundary", "interior")}
 def modules() -> dict[str, Path]:
     """Our modules by their name below psdr_jit, without the packages' __init__ files."""
     found = {}
-    for path in sorted(ROOT.rglob("*.py")):
-        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        if not name.endswith("__init__"):
-            found[name] = path
+    for root, prefix in ((ROOT, ""), (ROOT.parent / "plugins", "plugins.")):
+        for path in sorted(root.rglob("*.py")):
+            name = prefix + ".".join(path.relative_to(root).with_suffix("").parts)
+            if not name.endswith("__init__"):
+                found[name] = path
     return found
 
 

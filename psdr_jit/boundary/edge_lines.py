@@ -130,6 +130,11 @@ def radiance_by_depth(job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: in
     return by_depth, final
 
 
+def longest_path(job: Job) -> int:
+    """Vertices on both sides of an edge together, at most: the edge's side and an emitter take a segment each."""
+    return job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES
+
+
 def longest_subpath(job: Job) -> int:
-    """Vertices from the sensor to the receiver, at most: the edge's side and an emitter take a segment each."""
-    return recorded_vertices(job, job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
+    """Vertices from the sensor to the receiver that are recorded, at most."""
+    return recorded_vertices(job, longest_path(job))

@@ -26,10 +26,10 @@ from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
+from ..sampling.relevance import SecondaryEdges, line_weights
 from ..scene.facts import SceneFacts
 from . import indirect_material, segment_motion
-from .edge_lines import EdgeView, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
+from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
@@ -54,7 +54,7 @@ def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples
 
 def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -> mi.Spectrum:
     """L_− − L_+ for every recorded vertex, within the depth that its subpath leaves (flat, see `SubpathRecords`)."""
-    lane, left = records.lane_of(), records.depth - records.vertex_of()
+    lane, left = records.lane_of(), longest_path(job) - records.vertex_of()
     # Whoever is not seen by the sensor need not be known.
     useful = records.connected()
     kept = dr.compress(useful)
@@ -62,7 +62,7 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
     if n == 0:
         return dr.zeros(mi.Spectrum, dr.width(lane))
     slot = slots(records, kept)
-    by_depth, final = _both_sides(job, table, dr.gather(EdgeView, view, kept), records.depth + 1)
+    by_depth, final = _both_sides(job, table, dr.gather(EdgeView, view, kept), longest_path(job) + 1)
     needed = dr.gather(mi.Bool, useful, lane)
     slot = 2 * dr.gather(mi.UInt32, slot, lane)
     minus, plus = (
@@ -82,23 +82,22 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
 #: How the term is estimated, by form.
 ESTIMATORS = {
     "spatial": SecondaryTerm(
+        name=NAME,
+        use=Use.STEP,
         longest=longest_subpath,
-        edges=lambda job: secondary_edges(job, NAME, Use.STEP),
         sample=sample_lines,
         trace=lambda job, edges, line: trace_receivers(job, line),
         evaluate=evaluate,
     ),
     "material": SecondaryTerm(
+        name=NAME,
+        use=Use.BACKGROUND,
         longest=longest_subpath,
-        edges=lambda job: secondary_edges(job, NAME, Use.BACKGROUND),
         sample=sample_lines,
         trace=indirect_material.trace,
         evaluate=indirect_material.evaluate,
     ),
 }
-
-#: What lines are drawn for, by form.
-USES = {"spatial": Use.STEP, "material": Use.BACKGROUND}
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
@@ -128,7 +127,7 @@ TERM = Term(
     forward=lambda job: segment_motion.forward(job, ESTIMATORS[job.form]),
     backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATORS[job.form], grad_in),
     edges=EdgeSampling(
-        lambda job: line_weights(job, USES[job.form]),
+        lambda job: line_weights(job, ESTIMATORS[job.form].use),
         "the others are coplanar, or lie inside of closed surfaces",
     ),
 )

@@ -24,7 +24,7 @@ from ..core.streams import Stream
 from ..edges.table import look_behind
 from ..plan.job import Job
 from ..sampling.relevance import SecondaryEdges
-from .edge_lines import EdgeLine, EdgeView, longest_subpath, radiance_by_depth, slots, trace_receivers
+from .edge_lines import EdgeLine, EdgeView, longest_path, longest_subpath, radiance_by_depth, slots, trace_receivers
 from .segment_motion import BoundarySamples
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
@@ -72,7 +72,7 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
 
 def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
     """L_S for every recorded vertex, within the depth that its subpath leaves (flat, see `SubpathRecords`)."""
-    lane, left = records.lane_of(), records.depth - records.vertex_of()
+    lane, left = records.lane_of(), longest_path(job) - records.vertex_of()
     useful = records.connected()
     kept = dr.compress(useful)
     if dr.width(kept) == 0:
@@ -81,7 +81,7 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
     s = dr.gather(Background, b, kept)
     ray = mi.Ray3f(s.source.o, s.source.d, 0, s.view.wavelengths)
     by_depth, final = radiance_by_depth(
-        job, ray, s.source.intersection(), s.view.lane, records.depth + 1, mi.Bool(True)
+        job, ray, s.source.intersection(), s.view.lane, longest_path(job) + 1, mi.Bool(True)
     )
     needed = dr.gather(mi.Bool, useful, lane)
     slot = dr.gather(mi.UInt32, slot, lane)

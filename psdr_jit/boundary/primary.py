@@ -41,7 +41,7 @@ from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.distribution import stratified
-from ..sampling.rows import ROW_SAMPLER, RowSampler, edge_samples
+from ..sampling.rows import ROW_SAMPLER, RowSampler, edge_samples, row_state
 from ..scene.facts import SceneFacts
 
 NAME = "primary"
@@ -90,7 +90,7 @@ def film_weights(job: Job) -> list[mi.Float]:
 def primary_edges(job: Job) -> PrimaryEdges | None:
     """Edges that can move on the film. None: nothing can."""
     rows = job.call.memory[ROW_SAMPLER]
-    state = rows.init(NAME, film_weights(job))
+    state = row_state(job, NAME, lambda: film_weights(job))
     return None if state is None else PrimaryEdges(scene_edges(job), rows, state)
 
 
@@ -165,12 +165,13 @@ def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None])
         even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
         step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
         ΔL = job.call.counters.rejected.keep_finite(step)
-        edges.rows.learn(edges.state, sample.row, sample.t, ΔL)
         Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
         wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
         seen = seen_edge(job, edges, sample)
         sight, view = seen.sight, seen.view
         scale = seen.across / (view.J_px * sample.pdf)
+        if job.learns:
+            edges.rows.learn(edges.state, sample.row, sample.t, lambda: dr.max(dr.abs(ΔL)) * scale)
 
     with job.motion.attached() as moving:
         relative = moving.of_edge(edges.table, sight.at)

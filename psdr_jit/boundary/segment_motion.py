@@ -21,10 +21,11 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
+from ..edges.kind import Use
 from ..edges.location import EdgeLocation
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
-from ..sampling.relevance import SecondaryEdges
+from ..sampling.relevance import SecondaryEdges, secondary_edges
 from .sensor_subpath import SubpathRecords
 
 L = TypeVar("L")
@@ -47,8 +48,9 @@ class BoundarySamples:
 class SecondaryTerm(Generic[L, S]):
     """How one secondary boundary is estimated. Every step is detached."""
 
+    name: str  # of the term
+    use: Use  # what its lines are drawn for
     longest: Callable[[Job], int]  # vertices of the longest sensor subpath; < 1: there is nothing to estimate
-    edges: Callable[[Job], SecondaryEdges | None]  # what is sampled; None: nothing can contribute
     sample: Callable[[Job, SecondaryEdges], L]  # lines through edge points
     trace: Callable[[Job, SecondaryEdges, L], S | None]  # those that end where they should, with their ends
     evaluate: Callable[[Job, SecondaryEdges, S], BoundarySamples]  # what they are worth
@@ -106,15 +108,22 @@ def backward(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:
 
 def _samples(job: Job, term: SecondaryTerm) -> tuple[SecondaryEdges, BoundarySamples] | None:
     """Sampled, traced and evaluated; None if nothing is left."""
-    edges = term.edges(job)
+    edges = secondary_edges(job, term.name, term.use)
     if edges is None:
         return None
     segments = term.trace(job, edges, term.sample(job, edges))
     if segments is None:
         return None
     s = term.evaluate(job, edges, segments)
-    edges.rows.learn(edges.state, s.at.row, s.at.t, s.value)
+    if job.learns:
+        edges.rows.learn(edges.state, s.at.row, s.at.t, lambda: _worth(s))
     return edges, s
+
+
+def _worth(s: BoundarySamples) -> mi.Float:
+    """What each segment brings to the film per unit of motion, over its density. Per lane."""
+    per_vertex = dr.max(dr.abs(s.value))
+    return s.records.total(per_vertex, s.records.after(per_vertex))
 
 
 def _derivative_image(job: Job, term: SecondaryTerm) -> mi.TensorXf:

@@ -26,11 +26,12 @@ import mitsuba as mi
 
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
-from ..core.sensor_frame import SensorFrame, View, look_at
+from ..core.sensor_frame import View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
+from ..paths.rays import SHADOW_EPSILON, skip_emitters
 from ..paths.scattering import UNIFORM_SHARE
 from ..plan.job import Job
 
@@ -66,7 +67,7 @@ class Connection:
 class SubpathRecords:
     """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state."""
 
-    BYTES_RGB = 4 * (10 + 9 + 6 + 3)  # of one vertex
+    BYTES_RGB = 4 * (11 + 9 + 6 + 3)  # of one vertex
 
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
@@ -181,10 +182,9 @@ class _AtSensor:
     W: mi.Spectrum  # 0 where it is not seen
 
 
-def _connect(
-    scene: mi.Scene, frame: SensorFrame, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active: mi.Bool
-) -> _AtSensor:
+def _connect(job: Job, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active: mi.Bool) -> _AtSensor:
     """Connect the vertex to the sensor; `value`: of the boundary segment and the path that led here."""
+    frame = job.frame
     aperture = sampler.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
     view = look_at(frame, si.p, aperture)
     to_sensor = -view.ω
@@ -194,7 +194,15 @@ def _connect(
     f = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(to_sensor), seen)
     W = value * f * particle_correction(si, to_sensor) / view.J_px
     seen &= dr.any(W != 0)
-    seen &= ~scene.ray_test(si.spawn_ray_to(view.o), seen)
+    if job.options.hide_emitters:  # the sensor looks through them
+        seen &= si.shape.emitter() == None  # noqa: E711 (an array comparison)
+        ray = mi.Ray3f(view.o, view.ω)
+        ray.maxt = view.r * (1 - SHADOW_EPSILON)
+        pi = job.scene.ray_intersect_preliminary(ray, active=seen)
+        _, pi = skip_emitters(job.scene, ray, pi)
+        seen &= ~pi.is_valid()
+    else:
+        seen &= ~job.scene.ray_test(si.spawn_ray_to(view.o), seen)
     return _AtSensor(view, aperture, dr.select(seen, W, 0))
 
 
@@ -204,7 +212,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
 
     `limits.max_depth`: vertices at most.
     """
-    ctx, frame = mi.BSDFContext(mi.TransportMode.Importance), job.frame
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
     ray = mi.Ray3f(receivers.hit.o, receivers.hit.d, 0, receivers.wavelengths)
     pi = receivers.hit.intersection()
     value = mi.Spectrum(receivers.value)
@@ -212,10 +220,10 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     # Vertex 0 is what the segment comes from. Roulette judges the walk alone, not the segment that it started from.
     path = PathState.start(1)
     active = mi.Bool(True)
-    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, frame, limits]):
+    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits]):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         bsdf = si.bsdf()
-        end = _connect(job.scene, frame, sampler, si, bsdf, value * path.β, active)
+        end = _connect(job, sampler, si, bsdf, value * path.β, active)
         onward = bounce(si, bsdf, sampler, path, limits, ctx, active)
         following = onward.ray(si)
         g_connect = deposit(a, si.n, end.view.ω)

@@ -38,7 +38,8 @@ def run(args: argparse.Namespace) -> int:
 
     import mitsuba as mi
 
-    from psdr_jit.derivative.integrator_specs import require_samples, to_image
+    from psdr_jit.core.film import require_samples
+    from psdr_jit.derivative.integrator_specs import to_image
 
     require_samples(scene.sensors()[args.sensor], args.spp or 0)
     image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UnsupportedError
+from ..options import require_count, require_runtime
 from .ad import backpropagate
 
 #: Quadrature nodes per pixel for the integral of a reconstruction filter.
@@ -17,6 +18,15 @@ def require_film(film: mi.Film) -> None:
     """Films that re-weight samples themselves (`specfilm`) have no boundary splat here."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise UnsupportedError(f"film '{film.class_name()}' converts samples itself; use an `hdrfilm`")
+
+
+def require_samples(sensor: mi.Sensor, spp: int) -> None:
+    """Raise `OptionError` if a render of this many samples per pixel is more than a render can take; 0: its own."""
+    require_count("spp", spp)
+    film = sensor.film().crop_size()
+    samples = (spp or sensor.sampler().sample_count()) * int(film[0]) * int(film[1])
+    if not mi.variant().startswith("scalar"):  # those go pixel by pixel
+        require_runtime(0, samples)
 
 
 def clear(film: mi.Film) -> None:

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.film import require_samples
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages, block_means, standard_error
@@ -64,7 +65,7 @@ class CentralDifference:
         self.integrator = integrator_specs.reference(spec)
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
-        integrator_specs.require_samples(self.sensor, self.spp)
+        require_samples(self.sensor, self.spp)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
         self.primal = GroupedImages(groups=1)
         self.seconds = 0.0

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.film import require_samples
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
@@ -83,7 +84,7 @@ class DerivativeSampler:
         self.perturbation = perturbation
         self.integrator = integrator
         self.sensor = find_sensor(perturbation.scene, sensor)
-        integrator_specs.require_samples(self.sensor, spp)
+        require_samples(self.sensor, spp)
         self.spp = spp
         self.images = GroupedImages(groups)
         self.not_finite = 0     # pixel values that arrived as NaN or inf

@@ -16,7 +16,7 @@ import numpy as np
 
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
-from psdr_jit.options import FOLLOWS, require_count, require_runtime
+from psdr_jit.options import FOLLOWS
 from psdr_jit.plan.plan import Plan
 
 DEFAULT_INTEGRATOR = "psdr_path"
@@ -106,15 +106,6 @@ def build_term(spec: Mapping[str, Any], term: str) -> Any:
 def reference(spec: Mapping[str, Any]) -> Any:
     """Mitsuba's `path` with the path options of `spec`: what finite differences are taken of."""
     return build({"type": "path", **{k: spec[k] for k in PATH_OPTIONS if k in spec}})
-
-
-def require_samples(sensor: Any, spp: int) -> None:
-    """Raise `OptionError` if a render of this many samples per pixel is more than a render can take; 0: its own."""
-    require_count("spp", spp)
-    film = sensor.film().crop_size()
-    samples = (spp or sensor.sampler().sample_count()) * int(film[0]) * int(film[1])
-    if not mi.variant().startswith("scalar"):  # those go pixel by pixel
-        require_runtime(0, samples)
 
 
 def rejected(integrator: Any) -> int | None:

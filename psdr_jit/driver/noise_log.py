@@ -29,10 +29,10 @@ class NoiseLog:
     calls: int = 0
     measured: Measurement | None = None  # by the pilot
     current: Measurement | None = None  # with what was observed since
-    plan: object = None  # made from `current` when it was last due
+    share: tuple | None = None  # `(spp by term, form, reason)` that followed from `current` when it was last due
     pairs: int = 0  # of images that were compared since the last pilot
     weighed: dict[tuple[str, str], int] = field(default_factory=dict)  # observations that count, by (form, term)
-    last: dict[str, tuple[int, int, mi.TensorXf]] = field(default_factory=dict)  # term: (seed, paths, image)
+    last: dict[str, tuple[int, int, str, mi.TensorXf]] = field(default_factory=dict)  # term: (seed, paths, form, image)
     pending: list[tuple[str, str, int, mi.Float]] = field(default_factory=list)  # (form, term, paths, variance)
 
     @property
@@ -47,7 +47,7 @@ class NoiseLog:
     @property
     def due(self) -> bool:
         """Is this a call at which budgets may change?"""
-        return self.calls & (self.calls - 1) == 0
+        return self.needs_pilot or self.calls & (self.calls - 1) == 0
 
     def pilot(self, measured: Measurement) -> None:
         """Start again from a new pilot."""
@@ -63,10 +63,10 @@ class NoiseLog:
         compared = False
         for name, image in images.items():
             before = self.last.get(name)
-            if before is not None and before[0] != seed and before[1] == paths[name]:
-                self.pending.append((form, name, paths[name], variance_of_pair(image, before[2])))
+            if before is not None and before[0] != seed and before[1:3] == (paths[name], form):
+                self.pending.append((form, name, paths[name], variance_of_pair(image, before[3])))
                 compared = True
-            self.last[name] = (seed, paths[name], image)
+            self.last[name] = (seed, paths[name], form, image)
         self.pairs += compared
 
     def learn(self) -> None:

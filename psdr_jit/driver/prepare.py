@@ -23,7 +23,7 @@ from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
 from ..plan.job import Job
 from ..plan.motion import SceneMotion
-from ..plan.plan import SWITCHED_OFF, Geometry, Plan
+from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
@@ -34,6 +34,9 @@ from . import pilot
 from .noise_log import NoiseLog
 from .pilot import Measurement
 from .terms import TERMS
+
+#: Why a term that is needed may be left out by a given plan all the same.
+MAY_BE_OUT = (SWITCHED_OFF, NO_EDGES)
 
 #: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
 NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)
@@ -77,7 +80,7 @@ def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
     film = call.sensor.film()
     require_film(film)
-    given = Plan.from_json(call.options.plan) if call.options.plan_is_given else None
+    given = _given(call.options)
     budgets = _budgets(call) if given is None else {t.name: t.spp for t in given.terms}
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
@@ -85,7 +88,7 @@ def prepare(call: Call) -> Prepared:
     if call.mode == "backward":
         warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())
-    plan, log = _plan(question) if given is None else (_as_given(given, call.options), None)
+    plan, log = _plan(question) if given is None else (_as_given(given, question), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
@@ -94,15 +97,31 @@ def prepare(call: Call) -> Prepared:
     return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
 
 
-def _as_given(plan: Plan, options: Options) -> Plan:
-    """A plan that was given must speak of the terms that there are; it is executed but for terms with a budget of 0."""
+def _given(options: Options) -> Plan | None:
+    """The plan that was given, if one was; it must speak of the terms that there are."""
+    if not options.plan_is_given:
+        return None
+    plan = Plan.from_json(options.plan)
     known, named = [t.name for t in TERMS], [t.name for t in plan.terms]
     if sorted(known) != sorted(named):
         raise OptionError(
-            f"the given plan has the terms {', '.join(named)}, but there are {', '.join(known)}: "
+            f"the given plan has the terms {', '.join(named) or '(none)'}, but there are {', '.join(known)}: "
             "make it anew with psdr_jit.make_plan"
         )
-    budgets = {t.name: options.budget(t.budget) for t in TERMS}
+    return plan
+
+
+def _as_given(plan: Plan, q: _Question) -> Plan:
+    """The plan as it was given, but for terms with a budget of 0. Raises if it leaves out what is needed."""
+    geometry = _geometry(q, plan.prunes)
+    fresh = decide(TERMS, q.facts, q.call.options, geometry, dict.fromkeys(q.budgets, 1))
+    missing = {t.name for t in fresh if t.runs} - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
+    if missing:
+        raise OptionError(
+            f"the given plan leaves out {', '.join(sorted(missing))}, which this derivative needs: it was made for "
+            "other parameters or another scene; make it anew with psdr_jit.make_plan"
+        )
+    budgets = {t.name: q.call.options.budget(t.budget) for t in TERMS}
     off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0}
     return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
 
@@ -129,9 +148,7 @@ def _budgets(call: Call) -> dict[str, int]:
 def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     call, budgets = q.call, q.budgets
-    geometry = Geometry()
-    if q.facts.geometry_moves and call.options.plan == "lean":
-        geometry = Geometry(lone_convex(call.scene, call.sensor, q.facts, call.memory))
+    geometry = _geometry(q, call.options.plan == "lean")
     forms, reason = forms_to_try(call.scene, q.facts, call.options)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
@@ -153,9 +170,18 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
         if automatic:
             running = {term.name for term in plan.running}
             spp, why = log.current.allocate(form[0], budgets, running), "by measured noise, as costly as equal ones"
-        log.plan = made(spp, form, why)
+        log.share = (spp, form, why)
     log.calls += 1
-    return log.plan or plan, log
+    # Which terms run is decided anew in every call: the scene may have changed since.
+    return plan if log.share is None else made(*log.share), log
+
+
+def _geometry(q: _Question, prunes: bool) -> Geometry:
+    """What the terms want to know about the shapes' vertices, where anything is left out by it."""
+    call = q.call
+    if not (q.facts.geometry_moves and prunes):
+        return Geometry()
+    return Geometry(lone_convex(call.scene, call.sensor, q.facts, call.memory))
 
 
 def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:

@@ -1,13 +1,15 @@
 """What every kind of edge can be asked: the contract behind which meshes, outlines and intersections are alike.
 
-A kind is one family of discontinuities, with rows of its own in the edge table. The estimators know the table only; the
-table asks each kind about its own rows. Two sorts differ in how a line through one of their points is drawn:
+A kind is one family of discontinuities, with rows of its own in the edge table. Estimators ask the table, which asks
+each kind about its own rows. They tell apart two sorts only, by how a line through one of their points is drawn:
 
     FixedKind      a curve in space, the same from everywhere: draw the point first, then a direction
     ContourKind    an outline, elsewhere for every viewpoint: draw the direction, or the viewpoint, first
 
-A new kind is a file with a subclass of one of them, and an entry in `table.edge_table`. Everything is detached but for
-`displacement`. `row` counts the kind's own rows; lanes that are not `active` may hold any row and are ignored.
+A new kind is a file with a subclass of one of them, and an entry in `scene_table.edge_table`. `line_weights` and
+`wedges` say what it takes part in: a step inside a surface, say, matters for `Use.STEP` and casts no shadow. Everything
+is detached but for `displacement`. `row` counts the kind's own rows; lanes that are not `active` may hold any row and
+are ignored.
 """
 
 from __future__ import annotations

@@ -164,8 +164,9 @@ def flow_of(job: Job) -> Flow:
     """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
     traits = SceneTraits(facts.has_delta_emitters, any(s.delta_lobes for s in facts.shapes))
-    moves = facts.geometry_moves or not job.plan.prunes
-    return (FLOWS[job.form] if moves else RestingFlow)(job.scene, traits)
+    if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows
+        return RestingFlow(job.scene, traits)
+    return FLOWS[job.form](job.scene, traits)
 
 
 def _skipped(job: Job, p: CameraPass, records: PathRecords) -> mi.Float:

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.film import require_samples
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
@@ -165,7 +166,7 @@ def make_problem(
         raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
     found = tuple(views(scene, targets))
     for view in found:
-        integrator_specs.require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
+        require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
     params = traverse(scene, names)
     own = {v.parameter: v.begin(scene, params) for v in chosen}
     for variable in chosen:

@@ -102,6 +102,8 @@ def _after_roulette(s: Scattering, sampler, path: PathState, limits: PathLimits,
     β, η = path.β * s.weight, path.η * s.η
     β_max = dr.max(β)
     survival = dr.select(path.k + 1 >= limits.rr_depth, dr.minimum(β_max * dr.square(η), MOST_SURVIVAL), 1)
+    if not limits.end_black:  # what is black has a derivative all the same
+        survival = dr.select(β_max == 0, MOST_SURVIVAL, survival)
     survives = sampler.next_1d() < survival
     if limits.end_black:
         survives &= β_max != 0

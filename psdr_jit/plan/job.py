@@ -13,7 +13,7 @@ from ..options import Options
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from .call import Call
-from .motion import Motion
+from .motion import Motion, SceneMotion
 from .plan import Plan
 
 #: Of one render call: the geometry of its sensor.
@@ -55,6 +55,11 @@ class Job:
     def form(self) -> str:
         """What path vertices do while θ changes, see `options.FORMS`."""
         return self.plan.form
+
+    @property
+    def learns(self) -> bool:
+        """Do samples of this job tell about the scene's own motion, and not about a probe's?"""
+        return isinstance(self.motion, SceneMotion)
 
     @property
     def frame(self) -> SensorFrame:

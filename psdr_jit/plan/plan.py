@@ -16,6 +16,7 @@ from ..errors import OptionError
 from ..options import FORMS
 
 SWITCHED_OFF = "switched off by its budget"
+NO_EDGES = "none of its edges can contribute"
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,12 @@ class Plan:
 
 def _term_plan(data: dict) -> TermPlan:
     edges = data.pop("edges")
-    return TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=None if edges is None else EdgeCount(**edges))
+    term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=None if edges is None else EdgeCount(**edges))
+    if not (isinstance(term.name, str) and isinstance(term.runs, bool) and type(term.spp) is int):
+        raise TypeError("a term has a name, runs or not, and has a whole number of paths per pixel")
+    if (term.spp > 0) != term.runs:
+        raise ValueError(f"'{term.name}' has {term.spp} paths per pixel and {'runs' if term.runs else 'does not run'}")
+    return term
 
 
 def _shortened(text: str) -> str:
@@ -120,4 +126,4 @@ def with_edges(plan: Plan, counts: Mapping[str, EdgeCount]) -> Plan:
 def _out_without_edges(term: TermPlan) -> TermPlan:
     if term.edges is None or term.edges.sampled > 0:
         return term
-    return replace(term, runs=False, spp=0, segments=0, streams=(), reason="none of its edges can contribute")
+    return replace(term, runs=False, spp=0, segments=0, streams=(), reason=NO_EDGES)

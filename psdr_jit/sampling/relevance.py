@@ -25,7 +25,7 @@ from ..edges.wedges import Wedges
 from ..plan.job import Job
 from .directions import Cone, pdf_view, sample_view, towards_sphere
 from .distribution import stratified
-from .rows import ROW_SAMPLER, RowSampler
+from .rows import ROW_SAMPLER, RowSampler, row_state
 
 #: Share of the samples on edges of resting shapes while only shapes move.
 STATIC_SHARE = 0.25
@@ -86,9 +86,8 @@ class SecondaryEdges:
 def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
     """The edges that `term` samples, for lines anywhere in the scene; None if nothing can contribute."""
     table, movers = scene_edges(job), _movers(job, use)
-    weights = line_weights(job, use)
     rows = job.call.memory[ROW_SAMPLER]
-    state = rows.init(term, weights)
+    state = row_state(job, f"{term}/{use.value}", lambda: line_weights(job, use))
     if state is None:
         return None
     flags = mi.Bool(True)
@@ -106,7 +105,7 @@ def line_weights(job: Job, use: Use) -> list[mi.Float]:
     if lights is not None:
         casts = table.weights(lambda kind: kind.casts_shadow(lights, job.scene.bbox()))
         weights = [dr.select(c, w, 0) for c, w in zip(casts, weights, strict=True)]
-    if movers is None:
+    if movers is None or not weights:
         return weights
     seen = table.weights(lambda kind: movers.seen_from(kind.places()).share)
     return _balanced(weights, table.moving(), seen)

@@ -2,13 +2,15 @@
 
 An integrator draws the rows of its boundary terms with `memory[ROW_SAMPLER]`. The default draws them in proportion to
 their weights. Another one, a guide, may use what earlier calls have learned, under the conditions that keep estimates
-unbiased: `init` fixes a state for the whole call, forward and backward mode get the same one, and `pdf` is positive
-wherever a weight is.
+unbiased: `init` is called once in a render call and fixes the state for all its passes, what `learn` is told counts
+from the next call on, and `pdf` is positive wherever a weight is. A forward and a backward call draw the same samples
+only if nothing is learned in between.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -23,8 +25,10 @@ class RowSampler(ABC):
     """Draws `(row, t)` for one term. States are plain data; what is learned lives in the sampler."""
 
     @abstractmethod
-    def init(self, term: str, weights: list[mi.Float]) -> Any | None:
-        """The state for one call of `term`: `weights`, by kind of edge, of the rows. None if nothing can contribute."""
+    def init(self, what: str, weights: list[mi.Float]) -> Any | None:
+        """The state of one call for `what` (a term, and what its lines are drawn for): `weights`, by kind of edge, of
+        the rows. None if nothing can contribute.
+        """
 
     @abstractmethod
     def sample(self, state: Any, u: mi.Float64) -> tuple[mi.UInt32, mi.Float]:
@@ -34,14 +38,16 @@ class RowSampler(ABC):
     def pdf(self, state: Any, row: mi.UInt32, t: mi.Float) -> mi.Float:
         """Density of `sample`: probability of the row, times density of t."""
 
-    def learn(self, state: Any, row: mi.UInt32, t: mi.Float, value: mi.Spectrum) -> None:
-        """What samples of this call were worth, for later calls."""
+    def learn(self, state: Any, row: mi.UInt32, t: mi.Float, worth: Callable[[], mi.Float]) -> None:
+        """What samples of this call were worth, for later calls: contribution per unit of motion over density, computed
+        when asked for. One entry per sample.
+        """
 
 
 class WeightedRows(RowSampler):
     """Rows in proportion to their weights, t uniform. Learns nothing."""
 
-    def init(self, term: str, weights: list[mi.Float]) -> EdgeDistribution | None:
+    def init(self, what: str, weights: list[mi.Float]) -> EdgeDistribution | None:
         if not weights:
             return None
         distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
@@ -54,8 +60,19 @@ class WeightedRows(RowSampler):
         return pmf(state, row)
 
 
+#: Of one render call: the states by `what` they are for.
+STATES: Slot[dict[str, Any]] = Slot(dict)
+
 #: Of an integrator.
 ROW_SAMPLER: Slot[RowSampler] = Slot(WeightedRows)
+
+
+def row_state(job: Job, what: str, weights: Callable[[], list[mi.Float]]) -> Any | None:
+    """The sampler's state for `what`, fixed for the render call. None if nothing can contribute."""
+    states = job.shared[STATES]
+    if what not in states:
+        states[what] = job.call.memory[ROW_SAMPLER].init(what, weights())
+    return states[what]
 
 
 def edge_samples(job: Job, paths: int) -> int:

@@ -192,3 +192,18 @@ def test_the_outline_of_a_sphere_has_no_fireflies(llvm):
     motion.restore()
     assert max(largest) < 1e3  # 6e6 with such a ray
     assert 0 < int(integrator.stats["grazing"]) < 1e-4 * 16 * 16 * 64 * 64
+
+
+def test_shadows_are_seen_through_a_hidden_light(llvm):
+    """The lamp hangs between sensor and floor, on which a box casts its shadow; `hide_emitters` looks through it."""
+    lit = scene(
+        camera=camera((0, 5, 0.01), (0, 0, 0)),
+        lamp={"type": "rectangle", "to_world": T().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(0.6),
+              "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}},
+        floor={"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(3), "bsdf": white()},
+        box={"type": "cube", "to_world": T().translate([0.2, 1.2, 0.1]).rotate([0, 1, 0], 20).scale([0.4, 0.1, 0.3])},
+    )  # fmt: skip
+    motion = perturb(lit, "box.vertex_positions", (1, 0, 0.3))
+    spec = {"type": "psdr_path", "max_depth": 2, "hide_emitters": True}
+    reference = fd(motion, spec, 0.02, 16, 1024)
+    assert_grad_close(forward(motion, spec, SEEDS, 64), reference, 0.02)

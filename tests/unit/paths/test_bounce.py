@@ -148,3 +148,18 @@ def test_walks_that_look_follow_the_paths(variant):
     _, count, _ = walk(scene, sampler(), ray, pi, unlimited, NoSink(), emission, mi.Bool(True))
     assert few == int(dr.max(count)[0]) or few == int(dr.max(count)[0]) + 1
     assert few > DEPTH
+
+
+@pytest.mark.parametrize("rr_depth", [1, 50])
+def test_black_paths_go_on_where_their_derivative_is_wanted(llvm, rr_depth):
+    """Roulette would end a throughput of 0 for certain; without `end_black` it must not, however early it starts."""
+    scene = room({"type": "diffuse", "reflectance": 0.0})
+    counts = {}
+    for end_black in (True, False):
+        rules = limits(rr_depth=rr_depth, end_black=end_black)
+        ray, pi, emission = first_hit(scene, rays(), False)
+        _, vertices, _ = walk(scene, sampler(), ray, pi, rules, NoSink(), emission, mi.Bool(True))
+        on_ball = np.array(pi.shape == mi.ShapePtr(scene.shapes()[0]))
+        counts[end_black] = np.array(vertices)[on_ball]
+    assert len(counts[True]) > COUNT / 10 and (counts[True] == 1).all()
+    assert (counts[False] > 1).mean() > 0.9

@@ -221,3 +221,45 @@ def test_backward_mode_has_no_direction(llvm):
     scene = scene_of("cbox")
     with pytest.raises(OptionError, match='direction="any"'):
         known().render_backward(scene, mi.traverse(scene), dr.ones(mi.TensorXf, (16, 16, 3)), spp=1)
+
+
+def test_terms_follow_the_scene_as_it_is(llvm):
+    """A lone convex body has no shadow on itself until it is dented: then at once, whatever was learned before."""
+    scene = scene_of("icosphere")
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4})
+    params = mi.traverse(scene)
+    original = np.array(params["ball.vertex_positions"])
+
+    def running(points: np.ndarray) -> set[str]:
+        params["ball.vertex_positions"] = mi.Float(points)
+        params.update()
+        dr.enable_grad(params["ball.vertex_positions"])
+        params.update()
+        integrator.render_forward(scene, params, seed=1, spp=2)
+        return {t.name for t in integrator.plan.running}
+
+    for _ in range(3):  # the third call is none at which budgets are reconsidered
+        assert running(original) == {"interior", "primary"}
+    dented = original.reshape(-1, 3).copy()
+    dented[0] *= 0.2
+    assert running(dented.ravel()) == ALL
+
+
+def test_a_moving_camera_sees_all_of_the_background(llvm):
+    """In material form only first vertices slide, but what lies behind an edge is seen with all of its light."""
+    scene = scene_of("cbox", res=8)
+    motion = perturb(scene, "sensor.to_world", (1, 0, 0))
+    means, errors = [], []
+    for plan in ("lean", "full"):
+        spec = {"type": "psdr_path", "max_depth": 6, "rr_depth": 50, "form": "material", "plan": plan}
+        integrator = integrator_specs.build({**spec, "sppc": 0, "sppp": 0, "sppd": 0, "sppi": 64})
+        images = []
+        for seed in range(16):
+            motion.attach()
+            images.append(np.array(integrator.render_forward(scene, motion.params, seed=seed)))
+        means.append(np.mean(images, (0, 3)))
+        errors.append(np.std(np.mean(images, 3), 0, ddof=1) / 4)
+    motion.restore()
+    z = (means[0] - means[1]) / np.hypot(*errors)
+    scale = np.sum(means[0] * means[1]) / np.sum(means[1] ** 2)
+    assert np.abs(z).max() < 6 and abs(scale - 1) < 0.05
