@@ -17,13 +17,13 @@ from ..core.film import require_film
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..errors import OptionError, ZeroDerivativeWarning
-from ..options import require_runtime, samples_per_pixel
+from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
 from ..plan.job import Job
 from ..plan.motion import SceneMotion
-from ..plan.plan import SWITCHED_OFF, Geometry, Plan
+from ..plan.plan import SWITCHED_OFF, Geometry, Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
@@ -77,7 +77,7 @@ def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
     film = call.sensor.film()
     require_film(film)
-    given = Plan.from_json(call.options.plan) if call.options.plan_is_given else None
+    given = _given(call.options) if call.options.plan_is_given else None
     budgets = _budgets(call) if given is None else {t.name: t.spp for t in given.terms}
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
@@ -85,7 +85,7 @@ def prepare(call: Call) -> Prepared:
     if call.mode == "backward":
         warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())
-    plan, log = _plan(question) if given is None else (_require_terms(given), None)
+    plan, log = _plan(question) if given is None else (given, None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
@@ -94,15 +94,21 @@ def prepare(call: Call) -> Prepared:
     return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
 
 
-def _require_terms(plan: Plan) -> Plan:
-    """A plan that was given must speak of the terms that there are."""
+def _given(options: Options) -> Plan:
+    """The plan that was made before, less the terms whose budget is 0: integrators of one term each may share it."""
+    plan = Plan.from_json(options.plan)
     known, named = [t.name for t in TERMS], [t.name for t in plan.terms]
     if sorted(known) != sorted(named):
         raise OptionError(
             f"the given plan has the terms {', '.join(named)}, but there are {', '.join(known)}: "
             "make it anew with psdr_jit.make_plan"
         )
-    return plan
+    off = {term.name for term in TERMS if options.budget(term.budget) == 0}
+    return replace(plan, terms=tuple(_switched_off(term) if term.name in off else term for term in plan.terms))
+
+
+def _switched_off(term: TermPlan) -> TermPlan:
+    return replace(term, runs=False, reason=SWITCHED_OFF, spp=0, segments=0, streams=())
 
 
 def _facts(call: Call) -> SceneFacts:
