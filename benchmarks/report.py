@@ -1,5 +1,7 @@
 """Charts and tables from stored rows, and the generated blocks of README.md. Measures nothing.
 
+All tables go to the README of the folder of results; the main one gets the table of what is supported and three charts.
+
     psdr bench --report                     rewrite all
     python -m benchmarks.report --check     exit status 1 if a table is out of date
 """
@@ -12,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import inverse_tables, planning_tables, rows, tables
+from benchmarks import inverse_tables, planning_tables, rows, sentences, tables
 from psdr_jit.scene.capabilities import support_table
 
 README = rows.ROOT / "README.md"
@@ -40,57 +42,66 @@ OPTIMISATIONS = (
     "iterations as fit into it."
 )
 ITERATIONS = "What an iteration consists of, at 256 x 256 pixels and 16 samples per pixel (medians):"
+QUARTILES = "Medians, and quartiles in brackets."
 WHAT_IS_WHAT = (
-    "Made by `psdr bench --report`. Errors are relative to the root mean square of the reference derivative image. The "
-    "gain is the least-squares slope against the reference (finite differences in the sweeps). Bias: root mean square "
-    "of what no number of renders would cure, or the bound below which it is not seen. Heavy-tail index: share of the "
-    "squared error in the top 0.1 % of pixel values, 0.004 for normal noise."
+    "Made by `psdr bench --report` from the rows beside this file. Errors are relative to the root mean square of the "
+    "reference derivative image. The gain is the least-squares slope against the reference (finite differences in the "
+    "sweeps). Bias: root mean square of what no number of renders would cure, or the bound below which it is not seen. "
+    "Heavy-tail index: share of the squared error in the top 0.1 % of pixel values, 0.004 for normal noise."
 )
 
 
-def benchmark_tables(found: list[dict[str, Any]]) -> str:
-    """What the README shows: charts, the summary of accuracy against speed, sweeps, checks."""
+def readme_charts(found: list[dict[str, Any]]) -> str:
+    """What the main README shows: three charts, what each says, and where that was measured."""
     of = grouped(found)
-    measured = of.get("accuracy", [])
+    makers = {"accuracy": sentences.accuracy, "stability": sentences.stability, "cost": sentences.cost}
+    blocks = [f"{pictures(rows.RESULTS, f'{name}.png', at='benchmarks/results/')}\n{make(of[name])}"
+              for name, make in makers.items() if of.get(name)]  # fmt: skip
+    shown = [row for name in makers for row in of.get(name, ())]
+    return "\n\n".join(blocks) + "\n" + sentences.machines(shown) if blocks else EMPTY
+
+
+def details(found: list[dict[str, Any]], folder: Path) -> str:
+    """The README of a folder of results: every chart and every table, summaries first."""
+    of = grouped(found)
+    blocks = [f"## {title}\n\n" + "\n\n".join(part for part in make() if part)
+              for title, there, make in sections(of, folder) if there]  # fmt: skip
+    return "\n\n".join(["# Results", WHAT_IS_WHAT, *blocks, "## Circumstances", *circumstances(found)]) + "\n"
+
+
+def sections(of: dict[str, list[dict[str, Any]]], folder: Path) -> list[tuple[str, Any, Any]]:
+    """`(title, rows it draws on, its parts)` of the README of a folder of results."""
+    measured, planned, inverse = of.get("accuracy", []), of.get("planning", []), of.get("inverse", [])
+    swept, costs, passes = of.get("stability", []), of.get("cost", []), of.get("backward_cost", [])
     lines = tables.summary(measured)
-    planned, inverse = of.get("planning", []), of.get("inverse", [])
-    parts = [
-        (lines, lambda: tables.summary_words(lines)),
-        (lines, lambda: tables.summary_table(lines)),
-        (lines, lambda: pictures("accuracy.png", "images.png", "ratios.png")),
-        (planned, lambda: PLANS + "\n\n" + planning_tables.plan_table(planned)),
-        (planned, lambda: planning_tables.prb_table(planned)),
-        (planned, lambda: planning_tables.forms_words(planned)),
-        (planned, lambda: pictures("forms.png")),
-        (inverse, lambda: OPTIMISATIONS + "\n\n" + inverse_tables.outcome_table(inverse)),
-        (inverse, lambda: optimised_pictures()),
-        (inverse, lambda: ITERATIONS + "\n\n" + inverse_tables.overhead_table(inverse)),
-        (of.get("stability"), lambda: SWEEPS + "\n\n" + tables.stability_table(of["stability"])),
-        (of.get("stability"), lambda: pictures("stability.png")),
-        (of.get("cost"), lambda: pictures("cost.png")),
-        (of.get("backward_cost"), lambda: timing_table([row for row in of["backward_cost"] if "wall_ms" in row])),
-        (of.get("checks"), lambda: check_table(of["checks"])),
-        (of.get("convergence"), lambda: convergence_table(of["convergence"])),
-    ]
-    blocks = [make() for rows_there, make in parts if rows_there]
-    return "\n\n".join([*blocks, *circumstances(found)]) if blocks else EMPTY
 
+    def shown(*names: str) -> str:
+        return pictures(folder, *names)
 
-def details(found: list[dict[str, Any]]) -> str:
-    """Every row as a table: the README of the results folder."""
-    of = grouped(found)
-    measured = of.get("accuracy", [])
-    parts = [
-        ("References", of.get("references"), lambda: tables.reference_table(of["references"], measured)),
-        ("Accuracy against speed", measured, lambda: tables.accuracy_table(measured)),
-        ("Forms and budgets", of.get("planning"), lambda: planning_tables.forms_table(of["planning"])),
-        ("Stability", of.get("stability"), lambda: tables.stability_details(of["stability"])),
-        ("Cost", of.get("cost"), lambda: tables.cost_table(of["cost"])),
-        ("Interior variance", of.get("backward_cost"),
-         lambda: variance_table([row for row in of["backward_cost"] if "variance" in row])),
-    ]
-    blocks = [f"## {title}\n\n{make()}" for title, there, make in parts if there]
-    return "\n\n".join(["# Every stored row", WHAT_IS_WHAT, *blocks, *circumstances(found)]) + "\n"
+    return [
+        ("Accuracy against speed", lines, lambda: (
+            tables.summary_words(lines), tables.summary_table(lines),
+            shown("accuracy.png", "images.png", "ratios.png"))),
+        ("Plans, forms and budgets", planned, lambda: (
+            PLANS, planning_tables.plan_table(planned), planning_tables.prb_table(planned),
+            planning_tables.forms_words(planned), shown("forms.png"))),
+        ("Optimisations", inverse, lambda: (
+            OPTIMISATIONS, inverse_tables.outcome_table(inverse), optimised_pictures(folder), ITERATIONS,
+            inverse_tables.overhead_table(inverse))),
+        ("Stability", swept, lambda: (SWEEPS, tables.stability_table(swept), shown("stability.png"))),
+        ("Cost", costs, lambda: (shown("cost.png"),)),
+        ("Backward passes", passes, lambda: (
+            timing_table([row for row in passes if "wall_ms" in row]), QUARTILES)),
+        ("Checks against finite differences", of.get("checks"), lambda: (check_table(of["checks"]),)),
+        ("Convergence", of.get("convergence"), lambda: (convergence_table(of["convergence"]),)),
+        ("References, every row", of.get("references"), lambda: (
+            tables.reference_table(of["references"], measured),)),
+        ("Accuracy against speed, every row", measured, lambda: (tables.accuracy_table(measured),)),
+        ("Forms and budgets, every row", planned, lambda: (planning_tables.forms_table(planned),)),
+        ("Stability, every row", swept, lambda: (tables.stability_details(swept),)),
+        ("Cost, every row", costs, lambda: (tables.cost_table(costs),)),
+        ("Interior variance", passes, lambda: (variance_table([row for row in passes if "variance" in row]),)),
+    ]  # fmt: skip
 
 
 def grouped(found: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
@@ -99,22 +110,22 @@ def grouped(found: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     return {name: [row for row in found if row["bench"] == name] for name in names}
 
 
-def pictures(*names: str) -> str:
-    """Links to the charts that exist."""
-    there = [name for name in names if (rows.RESULTS / "charts" / name).is_file()]
-    return "\n\n".join(f"![{CHARTS[name]}](benchmarks/results/charts/{name})" for name in there)
+def pictures(folder: Path, *names: str, at: str = "") -> str:
+    """Links to the charts that a folder of results has; `at` leads from the linking file to the folder."""
+    there = [name for name in names if (folder / "charts" / name).is_file()]
+    return "\n\n".join(f"![{CHARTS[name]}]({at}charts/{name})" for name in there)
 
 
-def optimised_pictures() -> str:
+def optimised_pictures(folder: Path) -> str:
     """Links to the strips of images before and after."""
     links = []
     words_of = {"result": "initial, final, target, error", "section": "cross-section and displacement"}
-    for path in sorted((rows.RESULTS / "inverse").glob("*.png")):
+    for path in sorted((folder / "inverse").glob("*.png")):
         name, _, kind = path.stem.rpartition("_")
         if kind not in words_of:
             continue
         words = f"{name}: {words_of[kind]}"
-        links.append(f"![{words}](benchmarks/results/inverse/{path.name})")
+        links.append(f"![{words}](inverse/{path.name})")
     return "\n\n".join(links)
 
 
@@ -149,7 +160,7 @@ def write(folder: Path) -> int:
         return 2
     for path in draw(folder):
         print(f"wrote {path}")
-    (folder / "README.md").write_text(details(stored_rows(folder)), encoding="utf-8")
+    (folder / "README.md").write_text(details(stored_rows(folder), folder), encoding="utf-8")
     print(f"wrote {folder / 'README.md'}")
     if folder == rows.RESULTS:
         README.write_text(current(), encoding="utf-8")
@@ -160,7 +171,7 @@ def write(folder: Path) -> int:
 def current() -> str:
     """The README with its blocks as the code and the rows have it."""
     text = with_block(README.read_text(encoding="utf-8"), "support", support_table())
-    return with_block(text, "bench", benchmark_tables(stored_rows(rows.RESULTS)))
+    return with_block(text, "bench", readme_charts(stored_rows(rows.RESULTS)))
 
 
 def timing_table(found: list[dict[str, Any]]) -> str:
@@ -223,7 +234,7 @@ def circumstances(found: list[dict[str, Any]]) -> list[str]:
     for text in sorted(groups):
         loads = [row["load"] for row in groups[text]]
         lines.append(f"- {text}, load {min(loads):.1f} to {max(loads):.1f}")
-    return ["Medians and quartiles.\n\n" + "\n".join(lines)]
+    return ["\n".join(lines)]
 
 
 def with_block(text: str, name: str, content: str) -> str:
@@ -241,7 +252,8 @@ def main() -> int:
     if not args.check:
         return write(rows.RESULTS)
     stale = current() != README.read_text(encoding="utf-8")
-    stale |= (rows.RESULTS / "README.md").read_text(encoding="utf-8") != details(stored_rows(rows.RESULTS))
+    written = (rows.RESULTS / "README.md").read_text(encoding="utf-8")
+    stale |= written != details(stored_rows(rows.RESULTS), rows.RESULTS)
     if stale:
         print("README.md is out of date; run:  psdr bench --report", file=sys.stderr)
     return int(stale)

@@ -48,6 +48,8 @@ COMMANDS = {
     "test": Command("psdr_jit.cli.test", "run the test suite (needs a clone)", renders=False),
 }
 PASSED_ON = ("bench", "test")  # commands whose options are not ours to know
+OWN_HELP = ("test",)  # of those: the help is ours, the program behind it would print its own
+HELP_FLAGS = {"-h", "--help"}
 
 
 def build_parser(wanted: str | None) -> argparse.ArgumentParser:
@@ -91,7 +93,9 @@ def dispatch(argv: list[str], restart: bool) -> int:
     wanted = next((word for word in argv if not word.startswith("-")), None)
     parser = build_parser(wanted)
     if wanted in PASSED_ON:
-        args, args.rest = parser.parse_args([wanted]), argv[argv.index(wanted) + 1 :]
+        rest = argv[argv.index(wanted) + 1 :]
+        asked = ["--help"] if wanted in OWN_HELP and HELP_FLAGS & set(rest) else []
+        args, args.rest = parser.parse_args([wanted, *asked]), rest
     else:
         args = parser.parse_args(argv)
     if COMMANDS[args.command].renders:

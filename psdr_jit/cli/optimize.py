@@ -22,7 +22,7 @@ OK, DIVERGED, INTERRUPTED = 0, 1, 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", metavar="CONFIG.toml", help="what to optimise; see README")
+    parser.add_argument("config", metavar="CONFIG.toml", help="what to optimise; scenes/inverse/README.md describes it")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: out/ and the name of the file)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
     parser.add_argument("--iterations", type=int, metavar="N", help="instead of those in the file")

@@ -1,4 +1,16 @@
-"""Run the test suite of this checkout. Extra arguments go to pytest, e.g.: psdr test -k edges -m slow"""
+"""Run the tests of this clone with pytest, in the environment of this command.
+
+Everything after `test` goes to pytest as it is; without arguments the whole suite runs, but not the tests marked slow
+(finite-difference references that take minutes). The tests are in a clone only, and pytest runs in its root.
+
+    ./psdr test                             all but the slow ones
+    ./psdr test -m slow                     the slow ones
+    ./psdr test -k edges -x                 those with "edges" in the name, up to the first failure
+    ./psdr test tests/unit/docs             those of one folder or file
+
+Exit status: 0 all passed, 1 a test failed or could not be collected, 2 wrong arguments or no test chosen,
+3 no clone, no pytest or no LLVM that works. pytest lists its own options with: python -m pytest --help
+"""
 
 from __future__ import annotations
 
@@ -21,7 +33,8 @@ EXIT_STATUS = {0: 0, 4: 2, 5: 2}  # pytest: all passed; wrong usage; nothing sel
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """For the help text only: `main` hands over everything that follows `test` unparsed."""
-    parser.add_argument("rest", nargs="*", metavar="ARG", help="passed on to pytest")
+    parser.usage = "psdr test [-h] [ARG ...]"
+    parser.add_argument("rest", nargs="*", metavar="ARG", help="option, file or folder for pytest")
 
 
 def checkout(folder: str, command: str) -> Path:

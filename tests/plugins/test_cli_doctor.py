@@ -188,6 +188,18 @@ def test_the_test_command_needs_a_clone(tmp_path: Path, monkeypatch, capsys) -> 
     assert "clone the repository" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["test", "--help"], ["test", "-h"], ["test", "-k", "edges", "--help"]])
+def test_help_of_the_test_command_is_ours(words, monkeypatch, capsys) -> None:
+    """pytest's own says neither what runs nor where; no clone and no LLVM are needed for it."""
+    monkeypatch.setattr(test_command.subprocess, "run", raiser(AssertionError("started pytest")))
+    monkeypatch.setattr(llvm, "ensure_llvm", raiser(AssertionError("looked for an LLVM")))
+    with pytest.raises(SystemExit) as stopped:
+        main.main(words)
+    text = capsys.readouterr().out
+    assert stopped.value.code == 0 and "usage: psdr test" in text
+    assert "goes to pytest" in text and "./psdr test -m slow" in text and "Exit status" in text
+
+
 def test_pytest_arguments_pass_through(monkeypatch) -> None:
     """Options are not ours to interpret, and pytest's statuses are translated."""
     seen = []
