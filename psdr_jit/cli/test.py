@@ -1,7 +1,8 @@
 """Run the tests of this clone with pytest, in the environment of this command.
 
 Everything after `test` goes to pytest as it is; without arguments the whole suite runs, but not the tests marked slow
-(finite-difference references that take minutes). The tests are in a clone only, and pytest runs in its root.
+(finite-difference references that take minutes). The tests are in a clone only, and pytest runs in its root, in as many
+processes as there are cores (`-n 0`: in one, as with `-s` or `--pdb`).
 
     ./psdr test                             all but the slow ones
     ./psdr test -m slow                     the slow ones

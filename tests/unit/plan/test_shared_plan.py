@@ -54,7 +54,7 @@ def test_integrators_with_the_same_plan_agree(scene, plan):
 
 
 def test_a_budget_of_0_switches_a_term_of_the_plan_off(scene, plan):
-    integrator = mi.load_dict({"type": "psdr_path", "sppp": 0, "plan": plan.to_json()})
+    integrator = mi.load_dict({"type": "psdr_path", "max_depth": 2, "sppp": 0, "plan": plan.to_json()})
     psdr_jit.gradient(scene, BOX, MOVE, integrator=integrator, seeds=1)
     assert not integrator.plan.term("primary").runs and "budget" in integrator.plan.term("primary").reason
     assert integrator.plan.term("direct") == plan.term("direct")
