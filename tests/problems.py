@@ -105,10 +105,10 @@ PROBLEMS = (
     # films and options
     Problem("disk_rim", "disk.to_world", 0.005, direction=X, load=RGBA, tag="alpha-environment"),
     Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X, load=RGBA, tag="alpha", slow=True),
-    Problem("hidden_emitter", "card.vertex_positions", 0.005, direction=X, load=RGBA, options=HIDDEN),
+    Problem("hidden_emitter", "card.vertex_positions", 0.005, direction=X, load=RGBA, options=HIDDEN, slow=True),
     # edges in contact
     Problem("concave_corner", "camera.to_world", 0.002, direction=X),
-    Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y),
+    Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y, slow=True),
     Problem("three_sheets", "camera.to_world", 0.002, direction=X),
     Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z, slow=True),
     # shadows, and what surfaces see of each other
@@ -116,11 +116,11 @@ PROBLEMS = (
     Problem("area_shadow", "light.to_world", 0.01, direction=X),
     Problem("area_shadow", "floor.to_world", 0.005, direction=Y, slow=True),
     Problem("area_shadow", "camera.to_world", 0.004, direction=X),
-    Problem("area_shadow", "blocker.vertex_positions", 0.004, direction=X, load=DEPTH_3, tag="indirect"),
+    Problem("area_shadow", "blocker.vertex_positions", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
     Problem("point_shadow", "blocker.vertex_positions", 0.003, direction=X),
     Problem("point_shadow", "lamp.position", 0.004, direction=X, slow=True),
     Problem("directional_shadow", "blocker.to_world", 0.003, direction=X),
-    Problem("directional_shadow", "sun.to_world", 0.002, rotate=Z),
+    Problem("directional_shadow", "sun.to_world", 0.002, rotate=Z, slow=True),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X),
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
     Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X, slow=True),
@@ -143,7 +143,7 @@ PROBLEMS = (
     # shapes that cut into each other
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=Y),
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=X, slow=True),
-    Problem("sunk_ball", "ball.to_world", 0.005, direction=X),
+    Problem("sunk_ball", "ball.to_world", 0.005, direction=X, slow=True),
     Problem("sunk_ball", "floor.to_world", 0.005, direction=Y, slow=True),
     Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3, "lift": -0.05},
             tag="sunk", slow=True),

@@ -122,7 +122,9 @@ def card():
     return scene_io.load_scene(scene_io.shipped_scene("emissive_card.xml"))
 
 
-@pytest.mark.parametrize("how", [dict(direction=(1, 0, 0)), dict(rotate=(0, 0, 1))])
+@pytest.mark.parametrize(
+    "how", [pytest.param(dict(direction=(1, 0, 0)), marks=pytest.mark.slow), dict(rotate=(0, 0, 1))]
+)
 def test_moving_card_passes(card, how):
     """Primary boundary alone; oracle: finite differences of `path`."""
     result = check_gradient(card, "card.vertex_positions", integrator="psdr_path", max_seconds=20, **how)

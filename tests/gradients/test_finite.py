@@ -12,7 +12,7 @@ from problems import PROBLEMS, Problem
 from psdr_jit.derivative import integrator_specs
 
 SIZE, SPP = 16, 4
-QUICK = ("area_shadow", "environment_shadow", "sunk_ball", "cbox", "glossy_floor", "rough_dielectric")
+QUICK = ("area_shadow", "sunk_ball", "rough_dielectric")
 
 
 def check(problem: Problem, seeds: int) -> None:

@@ -24,6 +24,7 @@ def vertices(scene):
     return np.array(mi.traverse(scene)[demo_run.PARAMETER]).reshape(-1, 3)
 
 
+@pytest.mark.slow
 def test_the_box_comes_back_and_the_scene_is_left_as_it_was(scene):
     before, seen = vertices(scene), []
     found = demo_run.recover_pose(scene, iterations=ITERATIONS, progress=lambda done, total, history: seen.append(done))

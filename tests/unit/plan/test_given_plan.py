@@ -43,7 +43,8 @@ def test_it_is_executed_as_it_is(scene):
     first = integrator_specs.build(SPEC)
     expected = derivative(scene, first)
     given = mi.load_dict({**SPEC, "plan": first.plan.to_json()})
-    assert np.array_equal(derivative(scene, given, spp=99), expected)  # the plan's own samples count
+    image = derivative(scene, given, spp=99)  # the plan's own samples count
+    assert np.allclose(image, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
     assert given.plan == first.plan
 
 

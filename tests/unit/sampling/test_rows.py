@@ -30,10 +30,9 @@ class Listener(WeightedRows):
 
 
 @pytest.mark.parametrize("form", ["spatial", "material"])
-def test_it_is_asked_once_in_a_call_and_told_in_every_pass(llvm, form):
+def test_it_is_asked_once_in_a_call_and_told_by_every_term(llvm, form):
     scene = scene_io.load_scene(scene_io.shipped_scene("cbox.xml"), res=16)
     motion = perturb(scene, "small-box.vertex_positions", (1, 0, 0))
-    # memory for a third of the secondary samples: several passes
     spec = {"type": "psdr_path", "max_depth": 4, "form": form, **BUDGETS}
     images = []
     for sampler in (WeightedRows(), Listener()):
@@ -42,7 +41,7 @@ def test_it_is_asked_once_in_a_call_and_told_in_every_pass(llvm, form):
         motion.attach()
         images.append(np.array(integrator.render_forward(scene, motion.params, seed=1)))
     motion.restore()
-    assert np.array_equal(*images)
+    assert np.allclose(*images, rtol=1e-4, atol=1e-6 * np.abs(images[0]).max())  # sums in another order
     indirect = {"spatial": "indirect/step", "material": "indirect/background"}[form]
     assert sorted(sampler.states) == sorted(["primary", "direct/shadow", indirect])
     assert len(sampler.heard) == 3
