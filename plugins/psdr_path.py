@@ -45,7 +45,8 @@ class PathSpaceIntegrator(TermIntegrator):
          surfaces) or `auto`, whichever suits the scene (Default: auto)
      * - plan
        - |string|
-       - `lean` leaves out what is certainly 0, `full` computes everything, for comparison (Default: lean)
+       - `lean` leaves out what is certainly 0, `full` computes everything, for comparison; or the text of a plan that
+         was made before (`Plan.to_json`), which is then executed as it is (Default: lean)
      * - direction
        - |string|
        - `known`, in forward mode only, leaves out what has velocity 0 as well (Default: any)

@@ -1,1 +1,1 @@
-"""What a derivative render does, decided before a ray is traced: terms, form, budgets; and the job each term gets."""
+"""What a derivative render does, decided before a ray is traced: terms, form, budgets; a term's job and its motion."""
