@@ -42,7 +42,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW = ("cube-up", "ball-up")  # the same pieces as "cube-turns" and those where the floor moves
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])
 def test_against_finite_differences(llvm, monkeypatch, case):
     from psdr_jit.edges import segments
 

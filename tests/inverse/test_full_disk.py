@@ -102,6 +102,7 @@ class Disk:
         monkeypatch.setattr(os, "fsync", fsync)
 
 
+@pytest.mark.slow  # the real full disks above are not
 def test_each_write_in_turn(llvm, tmp_path, monkeypatch, capsys):
     """The command ends with status 3 exactly if a file with final values is missing, and names it in one line."""
     config = write_config(tmp_path, 1)

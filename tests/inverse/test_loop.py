@@ -142,6 +142,7 @@ def test_minibatches_visit_every_view_alike(llvm):
     assert len({problem.seed(i, v, p) for i in range(50) for v in (0, 1) for p in range(3)}) == 300
 
 
+@pytest.mark.slow
 def test_batch_sensor_is_optimised(llvm):
     scene = batch_of()
     variable = Pose(BOX, 0.02, shift_axes="xz", start_shift=(0.2, 0, -0.1))
@@ -169,7 +170,7 @@ def test_no_kernel_is_compiled_after_the_first_iteration(llvm, name):
     assert new[0] > 0 and not any(new[1:]), new
 
 
-@pytest.mark.parametrize("iterations", [200, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("iterations", [100, pytest.param(1000, marks=pytest.mark.slow)])
 def test_memory_is_flat(llvm, iterations):
     """Resident memory, looked at ten times; what the first tenth leaves behind does not count."""
     target = np.zeros((16, 16, 3))
