@@ -81,7 +81,7 @@ PROBLEMS = (
     Problem("smooth_mesh", "ball.vertex_positions", 0.005, direction=X, slow=True),
     Problem("two_sided", "tent.vertex_positions", 0.005, rotate=Y, slow=True),
     # cameras
-    Problem("camera_perspective", "camera.to_world", 0.001, rotate=Y),
+    Problem("camera_perspective", "camera.to_world", 0.001, rotate=Y, slow=True),
     Problem("camera_perspective", "camera.to_world", 0.004, direction=Z, slow=True),
     Problem("camera_perspective", "camera.x_fov", 0.05, slow=True),
     Problem("camera_perspective", "camera.principal_point_offset_x", 0.0005, slow=True),
@@ -126,7 +126,7 @@ PROBLEMS = (
     Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X, slow=True),
     Problem("tube_shadow", "blocker.to_world", 0.004, direction=X, slow=True),
     Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
-    Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X),
+    Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
     Problem("constant_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
     Problem("faceted_ball", "blocker.vertex_positions", 0.004, rotate=(1, 1, 0), slow=True),
     Problem("faceted_ball", "blocker.vertex_positions", 0.004, direction=X, slow=True),

@@ -73,7 +73,7 @@ CASES = (
 )
 
 
-SLOW = ("points of the light move",)
+SLOW = ("points of the light move", "shadow of an edge")
 
 
 @pytest.mark.parametrize(
