@@ -26,6 +26,8 @@ class TermIntegrator(ADIntegrator):
 
     def __init__(self, props):
         self.options = Options.from_properties(props, [term.budget for term in TERMS])
+        if self.options.plan_is_given:
+            Plan.from_json(self.options.plan)  # raises now what would be found at the first derivative
         super().__init__(props)
         self.memory = Memory()
         self.plan: Plan | None = None  # of the latest derivative

@@ -115,7 +115,9 @@ def _as_given(plan: Plan, q: _Question) -> Plan:
     """The plan as it was given, but for terms with a budget of 0. Raises if it leaves out what is needed."""
     geometry = _geometry(q, plan.prunes)
     fresh = decide(TERMS, q.facts, q.call.options, geometry, dict.fromkeys(q.budgets, 1))
-    missing = {t.name for t in fresh if t.runs} - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
+    needed = {t.name for t in fresh if t.runs}
+    missing = needed - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
+    missing |= _with_edges(plan, q) & needed
     if missing:
         raise OptionError(
             f"the given plan leaves out {', '.join(sorted(missing))}, which this derivative needs: it was made for "
@@ -124,6 +126,14 @@ def _as_given(plan: Plan, q: _Question) -> Plan:
     budgets = {t.name: q.call.options.budget(t.budget) for t in TERMS}
     off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0}
     return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
+
+
+def _with_edges(plan: Plan, q: _Question) -> set[str]:
+    """Terms that were left out for want of edges, and have some in this scene."""
+    out = {t.name for t in plan.terms if t.reason == NO_EDGES}
+    with dr.suspend_grad():
+        weights = {t.name: t.edges.weights(q.job(plan, 1)) for t in TERMS if t.name in out}
+    return {name for name, found in weights.items() if any(dr.any(w > 0)[0] for w in found)}
 
 
 def _facts(call: Call) -> SceneFacts:

@@ -77,8 +77,8 @@ class Plan:
             terms = tuple(_term_plan(term) for term in data.pop("terms"))
             plan = Plan(terms=terms, **data)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            text = _shortened(text)
-            raise OptionError(f"plan = {text}: not a plan ({error}); write one with Plan.to_json") from error
+            why = f"it has no {error}" if isinstance(error, KeyError) else error
+            raise OptionError(f"plan = {_shortened(text)}: not a plan ({why}); write one with Plan.to_json") from error
         if plan.form not in FORMS:
             raise OptionError(f"a plan has the form {plan.form!r}: use {' or '.join(FORMS)}")
         return plan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 from importlib import resources
@@ -93,7 +94,11 @@ def shipped_scene(name: str) -> Path:
     """Path of a scene file that is installed with the package, such as `cbox.xml`."""
     path = Path(str(resources.files("psdr_jit.scenes") / name))
     if not path.is_file():
-        raise SceneError(f"the package has no scene '{name}': the installation is incomplete")
+        there = sorted(str(file.relative_to(path.parent)) for file in path.parent.glob("*.xml"))
+        near = difflib.get_close_matches(path.name, there)
+        listed = ", ".join(there) or "none: install it anew"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {listed}"
+        raise SceneError(f"the package has no scene '{name}'; {hint}")
     return path
 
 
