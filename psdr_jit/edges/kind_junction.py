@@ -11,8 +11,8 @@ from ..core.sensor_frame import SensorFrame
 from .film_cover import EdgeOnFilm, straight_cover
 from .junction_points import bend, junction_motion
 from .junctions import JunctionRows
-from .kind import FixedKind, OnEdge, Side, Sight, Use
-from .kind_mesh import on_fixed, straight_point
+from .kind import OnEdge, Side, Sight, Use
+from .kind_mesh import BetweenFaces, on_fixed, straight_point
 from .lights import LightBounds
 from .location import EdgeLocation
 from .rows import EdgeRows
@@ -20,23 +20,13 @@ from .wedges import Wedges, meeting_wedges
 
 
 @dataclass(frozen=True)
-class Junctions(FixedKind):
+class Junctions(BetweenFaces):
     """Segments between triangles, and arcs between a ball and triangles, as edges between both surfaces."""
 
     rows: EdgeRows
     index: mi.UInt32  # by row: entry of `curves`
     curves: JunctionRows
     centre: mi.Point3f  # of the scene
-
-    @property
-    def count(self) -> int:
-        return dr.width(self.index)
-
-    def moving(self) -> mi.Bool:
-        return self.rows.moves
-
-    def places(self) -> mi.Point3f:
-        return (self.rows.p0 + self.rows.p1) / 2
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Being behind one of the surfaces is enough to be hidden."""

@@ -33,15 +33,10 @@ def on_fixed(x: mi.Point3f, dx: mi.Vector3f, centre: mi.Point3f, blur: mi.Float,
     )
 
 
-@dataclass(frozen=True)
-class MeshEdges(FixedKind):
-    """Rows of the edge set; `normals`: shading normals by vertex, None if all meshes are flat-shaded."""
+class BetweenFaces(FixedKind):
+    """Straight rows between two faces, whatever the faces belong to."""
 
-    meshes: tuple[mi.Mesh, ...]
     rows: EdgeRows
-    shapes: mi.ShapePtr  # by EdgeRows.shape0 and shape1
-    normals: mi.Normal3f | None
-    centre: mi.Point3f  # of the scene
 
     @property
     def count(self) -> int:
@@ -52,6 +47,17 @@ class MeshEdges(FixedKind):
 
     def places(self) -> mi.Point3f:
         return (self.rows.p0 + self.rows.p1) / 2
+
+
+@dataclass(frozen=True)
+class MeshEdges(BetweenFaces):
+    """Rows of the edge set; `normals`: shading normals by vertex, None if all meshes are flat-shaded."""
+
+    meshes: tuple[mi.Mesh, ...]
+    rows: EdgeRows
+    shapes: mi.ShapePtr  # by EdgeRows.shape0 and shape1
+    normals: mi.Normal3f | None
+    centre: mi.Point3f  # of the scene
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         seen = EdgeOnFilm.of(self.rows, frame)
