@@ -141,6 +141,7 @@ def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> Bound
     records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
     return BoundarySamples(
         at=segment.at,
+        ω=segment.ω,
         n_perp=segment.n_perp,
         wavelengths=segment.wavelengths,
         records=records,

@@ -15,7 +15,7 @@ from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
-from ..edges.kind import FixedKind, OnEdge, Sight
+from ..edges.kind import Line, Sight
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
 from ..plan.job import Job
@@ -31,13 +31,10 @@ class EdgeLine:
     lane: mi.UInt32
     row: mi.UInt32
     t: mi.Float
-    on: OnEdge
-    ω: mi.Vector3f  # from the viewer's side
+    through: Line
     n_perp: mi.Vector3f
     across: mi.Float  # |dx/dt × ω| [m]
     pdf_row: mi.Float  # of row and t, times the number of samples
-    pdf_sa: mi.Float
-    pdf_reversed: mi.Float  # per solid angle, of −ω
     wavelengths: mi.Color0f
     weight: mi.Spectrum  # of the wavelengths
     valid: mi.Bool
@@ -64,28 +61,17 @@ def sample_lines(job: Job, edges: SecondaryEdges) -> EdgeLine:
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     u = rng.next_2d()
 
-    def draw(kind, own_row: mi.UInt32, active: mi.Bool):
-        if isinstance(kind, FixedKind):
-            on = kind.on(own_row, t, mi.Vector4f(0, 0, 0, 1), active)
-            w = kind.wedges(own_row, edges.use, active)
-            ω = edges.sample_view(w, row, on.x, u, active)
-            return on, ω, *(edges.pdf_view(w, row, on.x, d, active) for d in (ω, -ω))
-        # For a contour take the direction first: parallel lines of direction ω touch a surface along one contour.
-        ω = mi.warp.square_to_uniform_sphere(u)
-        on = kind.on(own_row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), active)
-        return on, ω, mi.Float(dr.inv_four_pi), mi.Float(dr.inv_four_pi)
-
-    on, ω, pdf_sa, pdf_reversed = edges.table.ask(row, draw)
-    n_perp, across = on.across(ω)
-    valid = on.valid & (across > 0) & (pdf_sa > 0)
-    return EdgeLine(
-        lane, row, t, on, ω, n_perp, across, pdf_row, pdf_sa, pdf_reversed, wavelengths, weight, valid
-    )
+    views = edges.views(row)
+    through = edges.table.ask(row, lambda kind, own_row, active: kind.line(own_row, t, u, views, active))
+    n_perp, across = through.on.across(through.ω)
+    valid = through.on.valid & (across > 0) & (through.pdf_sa > 0)
+    return EdgeLine(lane, row, t, through, n_perp, across, pdf_row, wavelengths, weight, valid)
 
 
 def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     """The lines that end on a receiver; None if there are none."""
-    on, ω, n_perp, pdf_sa = line.on, line.ω, line.n_perp, line.pdf_sa
+    through, n_perp = line.through, line.n_perp
+    on, ω, pdf_sa = through.on, through.ω, through.pdf_sa
     start = on.x + on.aside * n_perp
     down = mi.Ray3f(start - on.lead * ω, -ω, 0, line.wavelengths)
     pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
@@ -98,7 +84,7 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
         ω = dr.select(turn, -ω, ω)
         n_perp = dr.select(turn & (on.aside == 0), -n_perp, n_perp)  # a contour's leads off its surface either way
         down, pi = dr.select(turn, up, down), dr.select(turn, other, pi)
-        pdf_sa = dr.select(open_end, pdf_sa + line.pdf_reversed, pdf_sa)
+        pdf_sa = dr.select(open_end, pdf_sa + through.pdf_reversed, pdf_sa)
     view = EdgeView(
         lane=line.lane,
         sight=Sight.of(on, line.row, line.t, ω, pi.t + on.lead, n_perp),

@@ -44,6 +44,7 @@ def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples
     dr.eval(value)
     return BoundarySamples(
         at=view.sight.at,
+        ω=view.sight.ω,
         n_perp=view.sight.n_perp,
         wavelengths=view.wavelengths,
         records=records,

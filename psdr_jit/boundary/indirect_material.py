@@ -55,18 +55,21 @@ def trace(job: Job, edges: SecondaryEdges, line: EdgeLine) -> Background | None:
 def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
     """What the background is worth at the sensor."""
     v = b.view
-    a = -(1 - b.ratio) * v.sight.n_perp
+    # An edge that moves as the line turns does so as x_D and x_S move against each other: ω̇ = (v_S − u_D)/r_S.
+    turn = edges.table.turn(v.sight.at, v.sight.ω, v.sight.n_perp) * (b.ratio / v.sight.r)
+    a = -(1 - b.ratio) * v.sight.n_perp - turn
     receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a)
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)
     return BoundarySamples(
         at=v.sight.at,
+        ω=v.sight.ω,
         n_perp=v.sight.n_perp,
         wavelengths=v.wavelengths,
         records=records,
         value=value,
-        source_motion=lambda moving: -b.ratio * dr.dot(v.sight.n_perp, moving.of_surface(b.source)),
+        source_motion=lambda moving: dr.dot(turn - b.ratio * v.sight.n_perp, moving.of_surface(b.source)),
     )
 
 

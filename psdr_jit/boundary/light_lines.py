@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.varying import varying
-from ..edges.kind import ContourKind, FixedKind, OnEdge
-from ..edges.wedges import Wedges
+from ..edges.kind import ContourKind, FixedKind, OnEdge, Views
 from ..sampling.relevance import SecondaryEdges
 
 #: Share of the samples under a sky whose direction follows the edge instead of the emitter.
@@ -35,24 +34,25 @@ def sample_light_lines(
     scene: mi.Scene, edges: SecondaryEdges, row: mi.UInt32, t: mi.Float, wavelengths, u: mi.Point2f
 ) -> LightLine:
     """One line for each point (row, t) of the edge table."""
+    views = edges.views(row)
 
     def draw(kind, own_row: mi.UInt32, active: mi.Bool) -> LightLine:
         it = dr.zeros(mi.Interaction3f, dr.width(row))
         it.wavelengths = wavelengths
         if isinstance(kind, FixedKind):
             on = kind.on(own_row, t, mi.Vector4f(0, 0, 0, 1), active)
-            return _from_fixed(scene, edges, kind, (own_row, row), on, it, u)
+            return _from_fixed(scene, views, kind, own_row, on, it, u)
         return _from_contour(scene, kind, own_row, t, it, u, active)
 
-    return edges.table.ask(row, draw)
+    return edges.table.ask(row, draw, among=lambda kind: kind.blocks_light)
 
 
 def _from_fixed(
-    scene: mi.Scene, edges: SecondaryEdges, kind: FixedKind, rows: tuple, on: OnEdge, it, u: mi.Point2f
+    scene: mi.Scene, views: Views, kind: FixedKind, row: mi.UInt32, on: OnEdge, it, u: mi.Point2f
 ) -> LightLine:
     """The emitter is sampled from the edge point; the edge must be an outline for that direction.
 
-    `rows`: of the kind, and of the table. Under a sky, `EDGE_SHARE` of the samples take a direction in which the edge
+    `row`: of the kind. Under a sky, `EDGE_SHARE` of the samples take a direction in which the edge
     is an outline (`_from_edge_or_sky`).
     """
     it.p = on.x
@@ -60,13 +60,13 @@ def _from_fixed(
         ds, weight = scene.sample_emitter_direction(it, u, False, on.valid)
         value, pdf = weight * ds.pdf, ds.pdf
     else:
-        ds, value, pdf = _from_edge_or_sky(scene, edges, kind, rows, on, it, u)
-    n_perp, across, outline = kind.open_side(rows[0], on.dx, ds.d, on.valid)
+        ds, value, pdf = _from_edge_or_sky(scene, views, kind, row, on, it, u)
+    n_perp, across, outline = kind.open_side(row, on.dx, ds.d, on.valid)
     return LightLine(on, n_perp, across, ds.d, ds.dist, ds.emitter, value, pdf, on.valid & outline)
 
 
 def _from_edge_or_sky(
-    scene: mi.Scene, edges: SecondaryEdges, kind: FixedKind, rows: tuple, on: OnEdge, it, u: mi.Point2f
+    scene: mi.Scene, views: Views, kind: FixedKind, row: mi.UInt32, on: OnEdge, it, u: mi.Point2f
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
     """Emitter sampling and directions that suit the edge: `(ds, L_e, pdf)`.
 
@@ -80,9 +80,9 @@ def _from_edge_or_sky(
     u = mi.Point2f(dr.select(by_edge, u.x / EDGE_SHARE, (u.x - EDGE_SHARE) / (1 - EDGE_SHARE)), u.y)
     ds, weight = scene.sample_emitter_direction(it, u, False, active & ~by_edge)
 
-    w: Wedges = kind.wedges(rows[0], edges.use, active)
-    ω = edges.sample_view(w, rows[1], it.p, u, active)
-    n, _, outline = kind.open_side(rows[0], on.dx, ω, active)
+    w = kind.wedges(row, views.use, active)
+    ω = views.sample(w, it.p, u, active)
+    n, _, outline = kind.open_side(row, on.dx, ω, active)
     probe = mi.Ray3f(it.p + on.offset * n + on.lead * ω, ω, 0, it.wavelengths)
     ω = dr.select(scene.ray_test(probe, active & by_edge & outline), -ω, ω)
     free = dr.zeros(mi.DirectionSample3f, dr.width(ω))
@@ -93,7 +93,7 @@ def _from_edge_or_sky(
 
     from_sky = active & (ds.emitter == mi.EmitterPtr(sky))
     pdf_em = scene.pdf_emitter_direction(it, ds, from_sky)
-    pdf_edge = sum(edges.pdf_view(w, rows[1], it.p, d, active) for d in (ds.d, -ds.d))
+    pdf_edge = sum(views.pdf(w, it.p, d, active) for d in (ds.d, -ds.d))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = -ds.d
     si.wavelengths = it.wavelengths

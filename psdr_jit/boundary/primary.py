@@ -170,14 +170,17 @@ def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None])
         seen = seen_edge(job, edges, sample)
         sight, view = seen.sight, seen.view
         scale = seen.across / (view.J_px * sample.pdf)
+        turn = edges.table.turn(sight.at, view.ω, sight.n_perp)
         if job.learns:
             edges.rows.learn(edges.state, sample.row, sample.t, lambda: dr.max(dr.abs(ΔL)) * scale)
 
     with job.motion.attached() as moving:
-        relative = moving.of_edge(edges.table, sight.at)
+        relative = moving.of_edge(edges.table, sight.at, view.ω)
+        turned = mi.Float(0)
         if job.facts.camera_moves:
             relative -= moving.of_camera(view.film, sample.aperture, sight.at.x)
-        motion = dr.dot(sight.n_perp, relative) * scale
+            turned = dr.dot(turn, moving.of_view(view.film, sample.aperture, view.ω))
+        motion = (dr.dot(sight.n_perp, relative) + turned) * scale
         return finish(films.develop_boundary(job.film, view.p, ΔL * motion, Δα * motion, wavelengths, seen.valid))
 
 

@@ -37,6 +37,7 @@ class BoundarySamples:
     """Boundary segments with their sensor subpaths. Lanes: segments; flat: vertex-major connections."""
 
     at: EdgeLocation  # x_B
+    ω: mi.Vector3f  # of the segment's line
     n_perp: mi.Vector3f
     wavelengths: mi.Color0f
     records: SubpathRecords
@@ -67,7 +68,7 @@ class _Motion:
 
 
 def _motion(job: Job, edges: SecondaryEdges, s: BoundarySamples, moving: Displacements) -> _Motion:
-    at_edge = dr.dot(s.n_perp, moving.of_edge(edges.table, s.at)) + s.source_motion(moving)
+    at_edge = dr.dot(s.n_perp, moving.of_edge(edges.table, s.at, s.ω)) + s.source_motion(moving)
     c = s.records.data
     surface = moving.of_surface(c.hit)
     camera = mi.Float(0)

@@ -1,15 +1,15 @@
 """What every kind of edge can be asked: the contract behind which meshes, outlines and intersections are alike.
 
 A kind is one family of discontinuities, with rows of its own in the edge table. Estimators ask the table, which asks
-each kind about its own rows. They tell apart two sorts only, by how a line through one of their points is drawn:
+each kind about its own rows. Two sorts share how a line through one of their points is drawn:
 
     FixedKind      a curve in space, the same from everywhere: draw the point first, then a direction
     ContourKind    an outline, elsewhere for every viewpoint: draw the direction, or the viewpoint, first
 
-A new kind is a file with a subclass of one of them, and an entry in `scene_table.edge_table`. `line_weights` and
-`wedges` say what it takes part in: a step inside a surface, say, matters for `Use.STEP` and casts no shadow. Everything
-is detached but for `displacement`. `row` counts the kind's own rows; lanes that are not `active` may hold any row and
-are ignored.
+A new kind is a file with a subclass of one of them, or of `EdgeKind` with a `line` of its own, and an entry in
+`scene_table.edge_table`. `line_weights` and `wedges` say what it takes part in: a step inside a surface, say, matters
+for `Use.STEP` and casts no shadow. Everything is detached but for `displacement`. `row` counts the kind's own rows;
+lanes that are not `active` may hold any row and are ignored.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -102,8 +103,34 @@ class Side:
         return Side(ray, none, mi.Bool(True), mi.Bool(own), mi.Bool(True))
 
 
+@dataclass
+class Line:
+    """A line through an edge point, in a direction in which the edge can matter; detached, one entry per sample."""
+
+    on: OnEdge
+    ω: mi.Vector3f  # unit, from the viewer's side
+    pdf_sa: mi.Float  # of ω, per solid angle
+    pdf_reversed: mi.Float  # of −ω
+
+
+class Views(Protocol):
+    """How directions through the points of given rows of the table are drawn: where they can matter, as `Wedges` say,
+    and where something is to be seen that moves.
+    """
+
+    use: Use
+
+    def sample(self, w: Wedges, x: mi.Point3f, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+        """Unit direction through x, from the viewer's side."""
+
+    def pdf(self, w: Wedges, x: mi.Point3f, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Its density per solid angle."""
+
+
 class EdgeKind(ABC):
     """One family of discontinuities."""
+
+    blocks_light: ClassVar[bool] = True  # do shadow rays notice it at all?
 
     @property
     @abstractmethod
@@ -135,6 +162,10 @@ class EdgeKind(ABC):
         """The point at t ∈ [0, 1) of `row` for a viewpoint: homogeneous, (x, y, z, 1) or (−direction, 0)."""
 
     @abstractmethod
+    def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
+        """A line through `row`, from `t` and `u`, all uniform in [0, 1)."""
+
+    @abstractmethod
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """What lies on side `which` of the edge: 0 towards −n_perp, 1 towards +n_perp."""
 
@@ -143,10 +174,19 @@ class EdgeKind(ABC):
         return sight.at.x
 
     @abstractmethod
-    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
-        """Vector of value 0 whose derivative is the velocity of the edge there, attached. Its part along the edge is
-        arbitrary.
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+        """Vector of value 0 whose derivative is the velocity of the edge there, attached, as seen by parallel lines of
+        the fixed direction ω (detached). Its part along the edge is arbitrary.
         """
+
+    def turn(
+        self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, n_perp: mi.Vector3f, active: mi.Bool
+    ) -> mi.Vector3f:
+        """κ [m]: where the direction ω turns by ω̇, the edge moves by κ·ω̇ along n_perp, in addition.
+
+        0 on curves in space, and on outlines, which slide along their surface.
+        """
+        return mi.Vector3f(0)
 
 
 class FixedKind(EdgeKind):
@@ -160,6 +200,12 @@ class FixedKind(EdgeKind):
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         """Where light along ω passes: `(n_perp to the open side, across, whether it is an outline for ω)`."""
 
+    def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
+        on = self.on(row, t, mi.Vector4f(0, 0, 0, 1), active)
+        w = self.wedges(row, views.use, active)
+        ω = views.sample(w, on.x, u, active)
+        return Line(on, ω, *(views.pdf(w, on.x, d, active) for d in (ω, -ω)))
+
 
 class ContourKind(EdgeKind):
     """An outline of a curved surface."""
@@ -167,3 +213,9 @@ class ContourKind(EdgeKind):
     @abstractmethod
     def inside(self, row: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         """A point inside the surface: what a light is asked to shine at before the outline is known."""
+
+    def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
+        """The direction first: parallel lines touch a surface along one contour."""
+        ω = mi.warp.square_to_uniform_sphere(u)
+        on = self.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), active)
+        return Line(on, ω, mi.Float(dr.inv_four_pi), mi.Float(dr.inv_four_pi))

@@ -101,7 +101,7 @@ class AnalyticCurves(ContourKind):
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         return Side.found_by(sight.beside(which), own=which == 0)
 
-    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""
         shape = dr.gather(mi.UInt32, self.curves.rows.shape, row, active)
         x = transform_point(attached_to_world(self.curves.shapes, shape), dr.detach(at.local))

@@ -58,6 +58,6 @@ class Junctions(BetweenFaces):
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         return Side.found_by(sight.beside(which))
 
-    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         index = dr.gather(mi.UInt32, self.index, row, active)
         return dr.select(active, junction_motion(self.curves, index, at.t, dr.detach(at.x), active), 0)

@@ -159,7 +159,7 @@ class MeshEdges(BetweenFaces):
         at_edge = (1 - t) * at0 + t * at1
         return dr.select(active & (at_edge < 0) & (at_apex > 0), at_edge / (at_edge - at_apex), 0)
 
-    def displacement(self, row: mi.UInt32, at: EdgeLocation, active: mi.Bool) -> mi.Vector3f:
+    def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         positions = attached_positions(self.meshes)
         v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (self.rows.v0, self.rows.v1))
         x0, x1 = (dr.gather(mi.Point3f, positions, v, active) for v in (v0, v1))

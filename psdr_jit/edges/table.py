@@ -27,14 +27,21 @@ class EdgeTable:
         return sum(kind.count for kind in self.kinds)
 
     def ask(
-        self, row: mi.UInt32, question: Callable[[EdgeKind, mi.UInt32, mi.Bool], T], active: mi.Bool | bool = True
+        self,
+        row: mi.UInt32,
+        question: Callable[[EdgeKind, mi.UInt32, mi.Bool], T],
+        among: Callable[[EdgeKind], bool] = lambda kind: True,
     ) -> T:
-        """`question(kind, row of that kind, active)`, answered for every lane by the kind that its row belongs to."""
+        """`question(kind, row of that kind, active)`, answered for every lane by the kind that its row belongs to.
+
+        Kinds that are not `among` those asked must not occur in `row`.
+        """
         answer, first = None, 0
         for kind in self.kinds:
-            own = (row >= first) & (row < first + kind.count) if len(self.kinds) > 1 else mi.Bool(True)
-            found = question(kind, row - first, own & active)
-            answer = found if answer is None else dr.select(own, found, answer)
+            if among(kind):
+                own = (row >= first) & (row < first + kind.count) if len(self.kinds) > 1 else mi.Bool(True)
+                found = question(kind, row - first, own)
+                answer = found if answer is None else dr.select(own, found, answer)
             first += kind.count
         return answer
 
@@ -58,9 +65,13 @@ class EdgeTable:
         """Where rays are aimed that ask whether the viewer sees the edges."""
         return self.ask(sight.at.row, lambda kind, row, own: kind.aim(row, sight, own))
 
-    def displacement(self, at: EdgeLocation) -> mi.Vector3f:
-        """Vector of value 0 whose derivative is the velocity of the edge there, attached."""
-        return self.ask(at.row, lambda kind, row, own: kind.displacement(row, at, own))
+    def displacement(self, at: EdgeLocation, ω: mi.Vector3f) -> mi.Vector3f:
+        """Vector of value 0 whose derivative is the velocity of the edges there, seen along ω, attached."""
+        return self.ask(at.row, lambda kind, row, own: kind.displacement(row, at, ω, own))
+
+    def turn(self, at: EdgeLocation, ω: mi.Vector3f, n_perp: mi.Vector3f) -> mi.Vector3f:
+        """By how much the edges there move along n_perp as ω turns: a covector on ω̇ [m]."""
+        return self.ask(at.row, lambda kind, row, own: kind.turn(row, at, ω, n_perp, own))
 
     def side(self, sight: Sight, which: mi.UInt32) -> Side:
         """Where to look on side `which` (0: −n_perp, 1: +n_perp) of edges."""

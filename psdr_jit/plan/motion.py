@@ -28,12 +28,16 @@ class Displacements(ABC):
         """Of the material point at the end of `hit`; 0 where there is no surface."""
 
     @abstractmethod
-    def of_edge(self, table, location) -> mi.Vector3f:
-        """Of a point of the edge table."""
+    def of_edge(self, table, location, ω: mi.Vector3f) -> mi.Vector3f:
+        """Of a point of the edge table, seen by lines of the fixed direction ω."""
 
     @abstractmethod
     def of_camera(self, film: mi.Point2f, aperture: mi.Point2f, x: mi.Point3f) -> mi.Vector3f:
         """Of the point at the depth of x on the camera ray through a fixed film position ([0, 1]², crop window)."""
+
+    @abstractmethod
+    def of_view(self, film: mi.Point2f, aperture: mi.Point2f, ω: mi.Vector3f) -> mi.Vector3f:
+        """Of the direction ω of that ray."""
 
     @abstractmethod
     def of_light(
@@ -103,12 +107,16 @@ class SceneDisplacements(Displacements):
         x = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), _follow(), there).p
         return dr.select(there, moved(x), 0)
 
-    def of_edge(self, table, location) -> mi.Vector3f:
-        return table.displacement(location)
+    def of_edge(self, table, location, ω: mi.Vector3f) -> mi.Vector3f:
+        return table.displacement(location, ω)
 
     def of_camera(self, film: mi.Point2f, aperture: mi.Point2f, x: mi.Point3f) -> mi.Vector3f:
         ray, _ = self.sensor.sample_ray(0, 0.5, film, aperture)
         return moved(ray.o + ray.d * dr.detach(dr.dot(x - ray.o, ray.d)))
+
+    def of_view(self, film: mi.Point2f, aperture: mi.Point2f, ω: mi.Vector3f) -> mi.Vector3f:
+        ray, _ = self.sensor.sample_ray(0, 0.5, film, aperture)
+        return moved(ray.d)
 
     def of_light(
         self, emitter: mi.EmitterPtr, it: mi.Interaction3f, active: mi.Bool

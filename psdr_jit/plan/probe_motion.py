@@ -71,11 +71,14 @@ class ProbeDisplacements(Displacements):
         x = hit.o + dr.select(hit.shape != 0, hit.t, 0) * hit.d
         return self._of_point(x, self.probe.takes_part(hit.shape))
 
-    def of_edge(self, table, location) -> mi.Vector3f:
+    def of_edge(self, table, location, ω: mi.Vector3f) -> mi.Vector3f:
         return self._of_point(location.x, table.moves(location))
 
     def of_camera(self, film: mi.Point2f, aperture: mi.Point2f, x: mi.Point3f) -> mi.Vector3f:
         return self._of_point(x, mi.Bool(self.probe.camera))
+
+    def of_view(self, film: mi.Point2f, aperture: mi.Point2f, ω: mi.Vector3f) -> mi.Vector3f:
+        return dr.cross(self.w, ω) if self.probe.camera else mi.Vector3f(0)
 
     def of_light(
         self, emitter: mi.EmitterPtr, it: mi.Interaction3f, active: mi.Bool

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.varying import varying
-from ..edges.kind import Use
+from ..edges.kind import Use, Views
 from ..edges.lights import LightBounds
 from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable
@@ -67,20 +67,32 @@ class SecondaryEdges:
         row, t = self.rows.sample(self.state, stratified(count, jitter))
         return row, t, self.rows.pdf(self.state, row, t) * varying(mi.Float, count)
 
-    def sample_view(self, w: Wedges, row, x: mi.Point3f, u: mi.Point2f, active) -> mi.Vector3f:
-        """Direction ω through the point `x` of `row` of the table, from the viewer's side."""
+    def views(self, row: mi.UInt32) -> RowViews:
+        """Directions through points of these rows of the table."""
+        return RowViews(self.use, self.movers, self.resting, row)
+
+
+@dataclass(frozen=True)
+class RowViews(Views):
+    """Where an edge can matter, and where a resting one has something to look at."""
+
+    use: Use
+    movers: Movers | None
+    resting: mi.Bool
+    row: mi.UInt32  # of the table
+
+    def sample(self, w: Wedges, x: mi.Point3f, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
         if self.movers is None:
             return w.sample(u)[0]
-        return sample_view(w, self.movers.seen_from(x), self._rests(row, active), AHEAD[self.use], u)[0]
+        return sample_view(w, self.movers.seen_from(x), self._rests(active), AHEAD[self.use], u)[0]
 
-    def pdf_view(self, w: Wedges, row, x: mi.Point3f, ω: mi.Vector3f, active) -> mi.Float:
-        """Density per solid angle of `sample_view`."""
+    def pdf(self, w: Wedges, x: mi.Point3f, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
         if self.movers is None:
             return w.pdf(ω)
-        return pdf_view(w, self.movers.seen_from(x), self._rests(row, active), AHEAD[self.use], ω)
+        return pdf_view(w, self.movers.seen_from(x), self._rests(active), AHEAD[self.use], ω)
 
-    def _rests(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        return dr.gather(mi.Bool, self.resting, row, active)
+    def _rests(self, active: mi.Bool) -> mi.Bool:
+        return dr.gather(mi.Bool, self.resting, self.row, active)
 
 
 def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:

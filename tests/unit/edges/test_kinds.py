@@ -116,7 +116,7 @@ def test_everything_shifted_shifts_the_edge(found):
         params[name] = moved(params[name], θ)
     params.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)
-    motion = kind.displacement(row, sight.at, mi.Bool(True))
+    motion = kind.displacement(row, sight.at, sight.ω, mi.Bool(True))
     assert np.abs(np.array(motion)).max() == 0
     speed = dr.dot(n_perp, tangents(motion))
     expected = np.array(dr.dot(n_perp, mi.Vector3f(SHIFT)) + dr.zeros(mi.Float, COUNT))
