@@ -49,6 +49,7 @@ class SceneTraits:
 
     delta_emitters: bool
     delta_lobes: bool  # only together with static geometry, see `scene.checks`
+    smooth_lights: bool  # smooth-shaded area lights, see `next_event`
 
 
 class Flow(ABC):
@@ -89,9 +90,9 @@ def material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements,
 def emission_towards(
     x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, moves: Displacements, active: mi.Bool
 ):
-    """Emission of the material point `hit` towards the attached point `x`: `(ω, L_e · measure)`, both attached."""
+    """Emission of the material point `hit` towards the attached point `x`: `(point, ω, L_e · measure)`, attached."""
     si, ω, measure = material_segment(x, hit, wavelengths, moves, active)
-    return ω, emitter.eval(si, active) * measure
+    return si, ω, emitter.eval(si, active) * measure
 
 
 def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
@@ -111,10 +112,18 @@ def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
 def next_event(
     si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, nee: EmitterSample, traits: SceneTraits, moves: Displacements
 ) -> mi.Spectrum:
-    """Scattered emitter sample, attached: f(ω) · value · MIS / pdf."""
+    """Scattered emitter sample, attached: f(ω) · value · MIS / pdf.
+
+    Mitsuba weighs samples of a smooth-shaded light as if its faces were turned as its shading normals n_s are. What
+    they are expected to bring then varies with n_s·ω in place of n_g·ω, and ends continuously at its shading outline.
+    """
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
-    ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, moves, active)
+    light, ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, moves, active)
+    if traits.smooth_lights:
+        n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
+        usable = active & light.is_valid() & (n_g > GRAZING) & (n_s > GRAZING)
+        value *= dr.relative_grad(dr.select(usable, n_s / n_g, 1))
     if traits.delta_emitters:
         is_delta = active & nee.delta
         seen = mi.SurfaceInteraction3f(si)

@@ -40,7 +40,7 @@ class SpatialFlow(Flow):
         w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * inv_pdf
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
-        ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
+        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
         if self.traits.delta_lobes:
             is_delta, ratio = vertex.onward.delta, throughput_ratio(vertex, following)
