@@ -73,3 +73,23 @@ def straight_cover(
     length = dr.clip(dr.norm(b.p - a.p), LEAST_LENGTH, film)
     length = dr.select(in_front, dr.select(overlaps_film(frame, a.p, b.p, reach, border), length, 0), film)
     return dr.select(hidden | behind, 0, relevance * length)
+
+
+def curve_cover(
+    frame: SensorFrame, border: int, corners: list[mi.Point3f], ends: tuple[mi.Point3f, mi.Point3f], known: mi.Bool
+) -> mi.Float:
+    """Relative sampling weight of a curve inside a face [px]: how far its `ends` are apart on the film where they are
+    `known`, else the longest side of the face; detached.
+    """
+    centre = mi.Point2f(LENS_CENTRE)
+    seen = [look_at(frame, p, centre).p for p in corners]
+    depth = [(frame.to_local @ p).z for p in corners]
+    nearest, farthest = dr.minimum(dr.minimum(*depth[:2]), depth[2]), dr.maximum(dr.maximum(*depth[:2]), depth[2])
+    lower, upper = (f(f(seen[0], seen[1]), seen[2]) for f in (dr.minimum, dr.maximum))
+    reach = dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
+    a, b = (look_at(frame, end, centre).p for end in ends)
+    film = dr.norm(mi.Vector2f(frame.crop_size))
+    length = dr.clip(dr.select(known, dr.norm(b - a), dr.norm(upper - lower)), LEAST_LENGTH, film)
+    overlaps = overlaps_film(frame, mi.Point2f(lower), mi.Point2f(upper), reach, border)
+    in_front = (nearest > frame.near) & (nearest < frame.far)
+    return dr.select(farthest <= frame.near, 0, dr.select(in_front, dr.select(overlaps, length, 0), film))

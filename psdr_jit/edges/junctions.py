@@ -233,7 +233,7 @@ def _upload(found: list[tuple]) -> JunctionTable:
     zeros = uploaded(mi.UInt32, np.zeros(count, np.uint32))
     none = mi.Vector2u(zeros, zeros)
     edges = EdgeRows(
-        v0=zeros, v1=zeros, apex0=zeros, apex1=zeros, p0=_point(start), p1=_point(end),
+        v0=zeros, v1=zeros, p0=_point(start), p1=_point(end),
         n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
         angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
         border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),

@@ -41,7 +41,7 @@ class OnEdge:
     """A point of an edge; detached, one entry per sample."""
 
     x: mi.Point3f  # [m]
-    dx: mi.Vector3f  # derivative of x by the row's parameter t [m]
+    dx: mi.Vector3f  # derivative of x by the row's parameter t; in general, the length of edge that a sample is [m]
     outward: mi.Vector3f  # of a contour: leads off the surface, across the edge; 0 where neither side is special
     local: mi.Point3f  # of a contour: the material point, in object space
     scale: mi.Float  # of a contour: size of its shape [m]; 0 on fixed edges

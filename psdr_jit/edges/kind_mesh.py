@@ -13,7 +13,7 @@ from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
 from .points import INSET, clearance, face_sides
-from .rows import EdgeRows, apex_uv, face_uv
+from .rows import EdgeRows, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
 
@@ -51,12 +51,11 @@ class BetweenFaces(FixedKind):
 
 @dataclass(frozen=True)
 class MeshEdges(BetweenFaces):
-    """Rows of the edge set; `normals`: shading normals by vertex, None if all meshes are flat-shaded."""
+    """Rows of the edge set."""
 
     meshes: tuple[mi.Mesh, ...]
     rows: EdgeRows
     shapes: mi.ShapePtr  # by EdgeRows.shape0 and shape1
-    normals: mi.Normal3f | None
     centre: mi.Point3f  # of the scene
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
@@ -135,29 +134,8 @@ class MeshEdges(BetweenFaces):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
         pi.shape = dr.gather(mi.ShapePtr, self.shapes, dr.select(use1, rows.shape1, rows.shape0), active)
-        fringe = self._fringe(rows, use1, sight.at.t, -sight.ω, active)
-        apex = apex_uv(corners)
-        uv += fringe * (apex - uv)
-        # Beyond a fringe only the apex is sure to be lit: the way to the centroid may lead back into the dark.
-        pi.prim_uv = uv + INSET * (dr.select(fringe > 0, apex, mi.Point2f(1 / 3)) - uv)
+        pi.prim_uv = uv + INSET * (mi.Point2f(1 / 3) - uv)
         return pi
-
-    def _fringe(self, rows: EdgeRows, use1: mi.Bool, t: mi.Float, viewer: mi.Vector3f, active) -> mi.Float:
-        """Share of the way from an edge to the opposite corner at which the shading normal begins to face the viewer.
-
-        Along an outline, interpolated normals turn away from the viewer before the surface does, and a BSDF is black
-        there. The step at the inner end of this fringe, as thin as the mesh is fine, is counted with the outline.
-        """
-        if self.normals is None:
-            return mi.Float(0)
-        active &= rows.smooth
-        apex = dr.select(use1, rows.apex1, rows.apex0)
-        viewer *= dr.sign(dr.dot(dr.select(use1, rows.n1, rows.n0), viewer))  # the back of an open surface
-        at0, at1, at_apex = (
-            dr.dot(dr.gather(mi.Normal3f, self.normals, v, active), viewer) for v in (rows.v0, rows.v1, apex)
-        )
-        at_edge = (1 - t) * at0 + t * at1
-        return dr.select(active & (at_edge < 0) & (at_apex > 0), at_edge / (at_edge - at_apex), 0)
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         positions = attached_positions(self.meshes)

@@ -23,9 +23,8 @@ ROUNDING_LEAD = 10.0
 #: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
 CURVE_LEAD = 0.02
 
-#: Share of the way from the edge to its face's centroid (beyond a dark fringe: to its apex) at which the face's own
-#: radiance is taken. On the edge itself rounding may put the point inside a surface on which the edge rests, and
-#: everything it sees would be occluded.
+#: Share of the way from the edge to its face's centroid at which the face's own radiance is taken. On the edge itself
+#: rounding may put the point inside a surface on which the edge rests, and everything it sees would be occluded.
 INSET = 3e-4
 
 #: Sine of the angle to its plane below which a face is seen edge-on: sixteen units in the last place of a direction.

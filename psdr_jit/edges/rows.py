@@ -14,8 +14,6 @@ class EdgeRows:
 
     v0: mi.UInt32  # global vertex indices of the end points
     v1: mi.UInt32
-    apex0: mi.UInt32  # the vertices of both faces that are not on the edge
-    apex1: mi.UInt32
     p0: mi.Point3f  # their positions [m]
     p1: mi.Point3f
     n0: mi.Normal3f  # unit normals of the adjacent faces, consistently oriented across the edge
@@ -61,9 +59,3 @@ def face_uv(corners: mi.Vector2u, t: mi.Float) -> mi.Point2f:
         return dr.select(corners.x == corner, 1 - t, 0) + dr.select(corners.y == corner, t, 0)
 
     return mi.Point2f(weight(1), weight(2))
-
-
-def apex_uv(corners: mi.Vector2u) -> mi.Point2f:
-    """Barycentric (b1, b2) of the corner of a face that is neither of `corners`."""
-    apex = 3 - corners.x - corners.y
-    return mi.Point2f(dr.select(apex == 1, 1.0, 0.0), dr.select(apex == 2, 1.0, 0.0))

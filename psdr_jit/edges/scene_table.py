@@ -27,9 +27,11 @@ from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
+from .kind_shading import ShadingOutlines
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
 from .segments import EdgeSet, edge_set
+from .smooth_faces import smooth_faces
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -58,7 +60,10 @@ def edge_table(job: Job) -> EdgeTable:
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     kinds, hidden = _between_faces(job, _edge_set(job, meshes, balls), meshes, overlapping, centre)
     curves = _analytic(job, analytic, centre)
-    return EdgeTable(tuple(kinds) + (() if curves is None else (curves,)), hidden)
+    if curves is not None:
+        kinds.append(curves)
+    kinds += _shading_outlines(job, meshes, centre)
+    return EdgeTable(tuple(kinds), hidden)
 
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
@@ -91,7 +96,7 @@ def _between_faces(
         if job.options.direction == "known" and job.plan.prunes:
             speed = vertex_speeds(found.meshes)
             rows.moves = rows.moves & (sum(dr.gather(mi.Float, speed, v) for v in (rows.v0, rows.v1)) > 0)
-        kinds.append(MeshEdges(found.meshes, rows, found.shapes, found.normals, centre))
+        kinds.append(MeshEdges(found.meshes, rows, found.shapes, centre))
     if found.junctions is not None:
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count
@@ -137,6 +142,15 @@ def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[Edge
     dr.eval(rows, hidden)
     kept = dr.compress(~hidden)
     return dr.gather(EdgeRows, rows, kept), kept, count
+
+
+def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
+    """Where interpolated normals turn away, on the meshes that are shaded with them."""
+    if not any(s.smooth for s in meshes):
+        return []
+    shapes = [job.scene.shapes()[s.index] for s in meshes]
+    faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
+    return [] if faces is None else [ShadingOutlines(faces, centre)]
 
 
 def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:

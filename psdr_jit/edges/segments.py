@@ -36,7 +36,7 @@ MAX_COMPARED_EDGES = 20000
 
 
 @dataclass
-class _MeshTopology:
+class MeshTopology:
     """Cached per mesh: valid while the faces stay the same and welded vertices stay together."""
 
     faces: mi.UInt32  # kept alive, so that its index identifies it
@@ -46,7 +46,7 @@ class _MeshTopology:
 
 
 #: By name of a mesh and its numbers of vertices and faces.
-TOPOLOGIES: Slot[dict[tuple[str, int, int], _MeshTopology]] = Slot(dict)
+TOPOLOGIES: Slot[dict[tuple[str, int, int], MeshTopology]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,6 @@ class EdgeSet:
     rows: EdgeRows | None
     shapes: mi.ShapePtr | None  # by EdgeRows.shape0 and shape1
     junctions: JunctionTable | None  # curves along which the meshes cut into each other, or balls into them
-    normals: mi.Normal3f | None  # by vertex, 0 on flat-shaded meshes; None if all are
 
 
 def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: tuple[Ball, ...] = ()) -> EdgeSet:
@@ -68,7 +67,7 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: t
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
-        return EdgeSet((), None, None, None, None)
+        return EdgeSet((), None, None, None)
     parts, solids, first_vertex = [], [], 0
     for i, mesh in enumerate(meshes):
         positions = dr.detach(mesh_positions(mesh))
@@ -82,19 +81,7 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: t
     junctions = find_junctions(solids, balls, memory)
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
     dr.eval(rows)
-    return EdgeSet(tuple(meshes), rows, shapes, junctions, _normals(meshes))
-
-
-def _normals(meshes: list[mi.Mesh]) -> mi.Normal3f | None:
-    """Shading normals of all vertices, detached."""
-    if not any(_is_smooth(mesh) for mesh in meshes):
-        return None
-    parts = []
-    for mesh in meshes:
-        n = mesh.vertex_count()
-        smooth = _is_smooth(mesh)
-        parts.append(dr.detach(mesh.vertex_normal(dr.arange(mi.UInt32, n))) if smooth else dr.zeros(mi.Normal3f, n))
-    return mi.Normal3f(*(dr.concat([p[axis] for p in parts]) for axis in range(3)))
+    return EdgeSet(tuple(meshes), rows, shapes, junctions)
 
 
 def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
@@ -105,7 +92,12 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
     return mi.Point3f(*(dr.concat([p[axis] for p in positions]) for axis in range(3)))
 
 
-def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> _MeshTopology:
+def known_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
+    """What `edge_set` has found out about `mesh`."""
+    return memory[TOPOLOGIES][mesh.id(), mesh.vertex_count(), mesh.face_count()]
+
+
+def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> MeshTopology:
     buffer = faces_buffer(mesh)
     key = (mesh.id(), dr.width(positions), dr.width(faces))
     known = memory[TOPOLOGIES].get(key)
@@ -115,7 +107,7 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Me
     topology = build_edge_topology(p, f)
     warn_about_mesh(mesh.id(), topology)
     shell = uploaded(mi.Float, edge_shells(topology, p, f))
-    known = _MeshTopology(buffer, topology, upload_topology(topology), shell)
+    known = MeshTopology(buffer, topology, upload_topology(topology), shell)
     memory[TOPOLOGIES][key] = known
     _still_holds(known, buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
     return known
@@ -139,7 +131,7 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
             warnings.warn(message, UnsupportedWarning, stacklevel=2)
 
 
-def _still_holds(known: _MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+def _still_holds(known: MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
     return same_faces(known.faces, buffer) and _welds_hold(known.device, positions, faces)
 
 
@@ -157,7 +149,7 @@ def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vec
     return bool((gap <= 8 * WELD_TOLERANCE * extent)[0])
 
 
-def _is_smooth(mesh: mi.Mesh) -> bool:
+def is_smooth(mesh: mi.Mesh) -> bool:
     return mesh.has_vertex_normals() and not mesh.has_face_normals()
 
 
@@ -173,7 +165,7 @@ def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
             jump |= dr.norm(other - dr.gather(type(vertex_data), vertex_data, vertex)) > SEAM_TOLERANCE
         return topo.split & jump
 
-    if _is_smooth(mesh):
+    if is_smooth(mesh):
         found |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
     bsdf = mesh.bsdf()
     textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
@@ -183,7 +175,7 @@ def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
     return found
 
 
-def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_vertex: int, moves: bool) -> EdgeRows:
+def _rows(mesh, positions, faces, topology: MeshTopology, shape: int, first_vertex: int, moves: bool) -> EdgeRows:
     topo = topology.device
     g = edge_geometry(positions, faces, topo)
     n = dr.width(topo.v0)
@@ -191,8 +183,6 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
     return EdgeRows(
         v0=topo.v0 + first_vertex,
         v1=topo.v1 + first_vertex,
-        apex0=_corner_vertex(faces, topo.f0, topo.apex0) + first_vertex,
-        apex1=_corner_vertex(faces, topo.f1, topo.apex1) + first_vertex,
         p0=g.p0,
         p1=g.p1,
         n0=g.n0,
@@ -201,7 +191,7 @@ def _rows(mesh, positions, faces, topology: _MeshTopology, shape: int, first_ver
         blur=g.blur,
         border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
-        smooth=~jumps & _is_smooth(mesh),
+        smooth=~jumps & is_smooth(mesh),
         pattern=jumps,
         traced=dr.full(mi.Bool, False, n),
         moves=dr.full(mi.Bool, moves, n),

@@ -1,7 +1,7 @@
 """Smooth-shaded meshes, which are black where their shading normals turn away from the viewer, before the outline.
 
-The step from that dark fringe to the lit face is counted with the outline, as seen from beyond the fringe: what a
-mesh of this fineness loses by that is the tolerance.
+The step from that dark fringe to the lit face moves by itself: it is an edge of its own. Without it gains are 0.3 to
+0.9; counted with the outline, they were up to 4 % off.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ TORUS_RADII = 1.0, 0.4  # of the ring, and of the tube
 LIGHT = {"emitter": {"type": "area"}}
 REFLECTOR = {"bsdf": {"type": "diffuse"}}
 
-MERGED, FINE = 0.03, 0.01  # accepted error of a gain: in general, and of reflecting spheres seen along their rings
-GLOWING_TORUS = 0.04  # which loses more
+TOLERANCE = 0.01  # accepted error of a gain
 MAX_STDERR = 0.01
 
 
@@ -69,14 +68,14 @@ def scene_of(shape: mi.Mesh) -> mi.Scene:
     return mi.load_dict({"type": "scene", "shape": shape, "camera": camera, **lights}, optimize=False)
 
 
-def assert_gain(shape: mi.Mesh, tolerance: float, param: str, **how):
-    """The derivative's gain against finite differences is 1 up to `tolerance` and its error."""
+def assert_gain(shape: mi.Mesh, param: str, **how):
+    """The derivative's gain against finite differences is 1 up to `TOLERANCE` and its error."""
     motion = perturb(scene_of(shape), param, **how)
     spec = {"type": "psdr_path", "max_depth": 1 if shape.is_emitter() else 2}
     reference = fd(motion, spec, STEP if "direction" in how else TURN, 64, 1024)
     slope = gain(forward(motion, spec, SEEDS, 512), reference[0::2], reference[1::2])
     assert slope.stderr < MAX_STDERR, slope
-    assert abs(slope.value - 1) < tolerance + 2 * slope.stderr, slope
+    assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope
 
 
 MOVED = ("shape.vertex_positions", {"direction": X})
@@ -95,7 +94,7 @@ EVERY_WAY = [
 @pytest.mark.parametrize("param, how", EVERY_WAY)
 def test_a_glowing_sphere(llvm, segments, param, how):
     """An area light shines to the front of the shading normal alone."""
-    assert_gain(sphere(segments, **LIGHT), MERGED, param, **how)
+    assert_gain(sphere(segments, **LIGHT), param, **how)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +102,7 @@ def test_a_glowing_sphere(llvm, segments, param, how):
 )
 @pytest.mark.parametrize("param, how", EVERY_WAY)
 def test_a_diffuse_sphere(llvm, segments, param, how):
-    assert_gain(sphere(segments, **REFLECTOR), FINE if segments >= 64 else MERGED, param, **how)
+    assert_gain(sphere(segments, **REFLECTOR), param, **how)
 
 
 @pytest.mark.slow
@@ -115,4 +114,37 @@ def test_a_diffuse_sphere(llvm, segments, param, how):
 )
 def test_a_torus(llvm, kind, param, how):
     """Its outline also passes in front of the torus itself."""
-    assert_gain(torus(200, **kind), GLOWING_TORUS if kind is LIGHT else MERGED, param, **how)
+    assert_gain(torus(200, **kind), param, **how)
+
+
+def above_a_floor(shape: mi.Mesh) -> mi.Scene:
+    """The camera sees a floor alone, and the lamp lights the shape from below: the floor sees its shading outline."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
+    pose = mi.ScalarTransform4f().look_at(origin=[0, -2.5, -0.6], target=[0, -1.36, -1.4], up=[0, 0, 1])
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.4]).scale(4)}
+    lamp = {} if shape.is_emitter() else {"lamp": {"type": "point", "position": [2.2, -1.5, -0.9], "intensity": 10.0}}
+    camera = {"type": "perspective", "fov": 40, "to_world": pose, "film": film}
+    return mi.load_dict({"type": "scene", "shape": shape, "floor": floor, "camera": camera, **lamp}, optimize=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["spatial", "material"])
+def test_a_floor_sees_the_shading_outline(llvm, form):
+    """Without it in the indirect term the gain is 1.41 in spatial form, 0.96 in material form."""
+    motion = perturb(above_a_floor(sphere(16, **REFLECTOR)), "shape.vertex_positions", direction=X)
+    spec = {"type": "psdr_path", "max_depth": 3, "form": form}
+    reference = fd(motion, spec, 2 * STEP, 64, 2048)
+    slope = gain(forward(motion, spec, SEEDS, 1024), reference[0::2], reference[1::2])
+    assert slope.stderr < 1.5 * MAX_STDERR, slope
+    assert abs(slope.value - 1) < 2.5 * slope.stderr, slope
+
+
+@pytest.mark.slow
+def test_a_floor_lit_by_a_smooth_light(llvm):
+    """What Mitsuba makes of the shading normals of a light is nearly modelled: 1.5 % at 64 segments, as documented."""
+    motion = perturb(above_a_floor(sphere(64, **LIGHT)), "shape.vertex_positions", direction=X)
+    spec = {"type": "psdr_path", "max_depth": 2}
+    reference = fd(motion, spec, 2 * STEP, 64, 2048)
+    slope = gain(forward(motion, spec, SEEDS, 1024), reference[0::2], reference[1::2])
+    assert slope.stderr < MAX_STDERR, slope
+    assert abs(slope.value - 1) < 0.02 + 2 * slope.stderr, slope

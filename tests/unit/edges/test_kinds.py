@@ -11,10 +11,11 @@ from psdr_jit.core.ad import tangents
 from psdr_jit.core.low_discrepancy import lane_sampler
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
-from psdr_jit.edges.kind import EdgeKind, FixedKind, Sight, Use
+from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
+from psdr_jit.edges.kind_shading import ShadingOutlines
 from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
@@ -25,6 +26,7 @@ PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
     AnalyticCurves: ("ball_shadow", ["blocker.to_world"]),
+    ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
 }
 
 
@@ -51,6 +53,9 @@ def found(request, llvm):
 
 def lines(kind: EdgeKind, row: mi.UInt32, t: mi.Float, rng):
     """Random lines through edge points: `(OnEdge, ω)`."""
+    if not isinstance(kind, (FixedKind, ContourKind)):
+        line = kind.line(row, t, rng.next_2d(), None, mi.Bool(True))
+        return line.on, line.ω
     ω = mi.warp.square_to_uniform_sphere(rng.next_2d())
     return kind.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), mi.Bool(True)), ω
 
@@ -76,6 +81,8 @@ def test_columns_have_the_width_of_the_rows(found):
 def test_points_lie_on_the_edge_and_know_its_tangent(found):
     """x(t) and dx/dt agree by finite differences, for one line at a time."""
     _, kind = found
+    if not isinstance(kind, (FixedKind, ContourKind)):
+        pytest.skip("its lines are drawn otherwise: dx is the length of edge that a line stands for")
     row, t, rng = rows_of(kind)
     h = 1e-2
     t = 0.1 + 0.8 * t
@@ -148,10 +155,14 @@ def test_rays_pass_beside(found):
 
 def test_directions_of_fixed_edges_have_the_density_they_say(found):
     _, kind = found
-    if not isinstance(kind, FixedKind):
+    if isinstance(kind, ContourKind):
         assert np.isfinite(np.array(kind.inside(rows_of(kind)[0], mi.Bool(True)))).all()
         return
-    row, _, rng = rows_of(kind)
+    row, t, rng = rows_of(kind)
+    if not isinstance(kind, FixedKind):
+        line = kind.line(row, t, rng.next_2d(), None, mi.Bool(True))
+        assert np.isfinite(np.array(line.pdf_sa)).all() and (np.array(line.pdf_sa) > 0).all()
+        return
     for use in (Use.STEP, Use.BACKGROUND):
         w = kind.wedges(row, use, mi.Bool(True))
         ω, pdf = w.sample(rng.next_2d())

@@ -1,0 +1,100 @@
+"""Faces of smooth-shaded meshes, with the shading normals of their corners: what shading outlines are found on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.compat import mesh_faces
+from ..core.memory import Memory
+from .segments import attached_positions, is_smooth, known_topology
+
+
+@dataclass
+class FaceRows:
+    """One entry per face; detached device arrays."""
+
+    corner: mi.Vector3u  # indices into the vertices of all smooth meshes, one mesh after the other
+    shape: mi.UInt32  # index into the smooth meshes
+    prim: mi.UInt32  # face of its mesh
+    shell: mi.Float  # as of `EdgeRows`
+    moves: mi.Bool  # can the face, or its shading normals, move?
+
+
+@dataclass(frozen=True)
+class SmoothFaces:
+    """Faces of `meshes`, detached but for what `attached_corners` says."""
+
+    meshes: tuple[mi.Mesh, ...]
+    shapes: mi.ShapePtr  # by FaceRows.shape
+    rows: FaceRows
+    positions: mi.Point3f  # by vertex [m]
+    normals: mi.Normal3f  # by vertex, as they are interpolated
+
+    def corners(self, corner: mi.Vector3u, active: mi.Bool) -> tuple[list[mi.Point3f], list[mi.Normal3f]]:
+        """Positions [m] and shading normals of the three corners, detached."""
+        return _gathered(self.positions, self.normals, corner, active)
+
+    def attached_corners(self, corner: mi.Vector3u, active: mi.Bool) -> tuple[list[mi.Point3f], list[mi.Normal3f]]:
+        """The same, attached to the meshes' vertices."""
+        return _gathered(attached_positions(self.meshes), _normals(self.meshes), corner, active)
+
+
+def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, memory: Memory) -> SmoothFaces | None:
+    """Faces of those `meshes` that are shaded smoothly; None if there are none. After `segments.edge_set`.
+
+    `outside`, by mesh: 1 if a closed mesh is seen from outside only, else 0.
+    """
+    parts, chosen, first = [], [], 0
+    for i, mesh in enumerate(meshes):
+        if not is_smooth(mesh):
+            continue
+        faces, topology = mesh_faces(mesh), known_topology(mesh, memory)
+        n = dr.width(faces)
+        shell = dr.zeros(mi.Float, n)
+        dr.scatter(shell, topology.shell, topology.device.f0)
+        dr.scatter(shell, topology.shell, topology.device.f1)
+        parts.append(
+            FaceRows(
+                corner=faces + first,
+                shape=dr.full(mi.UInt32, len(chosen), n),
+                prim=dr.arange(mi.UInt32, n),
+                shell=shell * dr.gather(mi.Float, outside, i),
+                moves=dr.full(mi.Bool, moving[i], n),
+            )
+        )
+        chosen.append(mesh)
+        first += mesh.vertex_count()
+    if not chosen:
+        return None
+    rows = parts[0] if len(parts) == 1 else _joined(parts)
+    shapes = mi.ShapePtr(chosen) if len(chosen) > 1 else mi.ShapePtr(chosen[0])
+    found = SmoothFaces(
+        tuple(chosen), shapes, rows, dr.detach(attached_positions(tuple(chosen))), dr.detach(_normals(tuple(chosen)))
+    )
+    dr.eval(rows, found.positions, found.normals)
+    return found
+
+
+def _joined(parts: list[FaceRows]) -> FaceRows:
+    dr.eval(parts)
+    moves = dr.concat([dr.select(part.moves, mi.UInt32(1), 0) for part in parts]) != 0
+    corner = mi.Vector3u(*(dr.concat([part.corner[axis] for part in parts]) for axis in range(3)))
+    shape, prim, shell = (dr.concat([getattr(p, name) for p in parts]) for name in ("shape", "prim", "shell"))
+    return FaceRows(corner, shape, prim, shell, moves)
+
+
+def _normals(meshes: tuple[mi.Mesh, ...]) -> mi.Normal3f:
+    """Shading normals of all vertices, attached."""
+    parts = [mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())) for mesh in meshes]
+    if len(parts) == 1:
+        return mi.Normal3f(parts[0])
+    return mi.Normal3f(*(dr.concat([part[axis] for part in parts]) for axis in range(3)))
+
+
+def _gathered(positions: mi.Point3f, normals: mi.Normal3f, corner: mi.Vector3u, active: mi.Bool):
+    p = [dr.gather(mi.Point3f, positions, corner[k], active) for k in range(3)]
+    n = [dr.gather(mi.Normal3f, normals, corner[k], active) for k in range(3)]
+    return p, n
