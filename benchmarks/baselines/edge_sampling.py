@@ -48,7 +48,7 @@ from psdr_jit.core.records import Hit
 from psdr_jit.core.streams import Stream, stream_seed
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import Sight
-from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_mesh import BetweenFaces
 from psdr_jit.edges.rows import EdgeRows
 from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.edges.table import EdgeTable, look_beside
@@ -105,10 +105,10 @@ def require_supported(facts: SceneFacts) -> None:
 
 def scene_distribution(table: EdgeTable) -> EdgeDistribution | None:
     """All straight edges, weight length × exterior angle."""
-    if any(isinstance(kind, AnalyticCurves) for kind in table.kinds):
+    if not all(isinstance(kind, BetweenFaces) for kind in table.kinds):
         raise UnsupportedError(
-            "edge sampling from camera paths has no outlines of spheres, cylinders and disks, which depend on the "
-            "viewer; use psdr_path, or meshes in their place"
+            "edge sampling from camera paths has no outlines of spheres, cylinders and disks, nor of smooth-shaded "
+            "meshes, which depend on the viewer; use psdr_path, or flat-shaded meshes in their place"
         )
     return WeightedRows().init("edge sampling", [kind_weights(kind.rows) for kind in table.kinds])
 
@@ -227,7 +227,7 @@ def sample_view(
     n_perp, across = on.across(ω)
     sight = Sight.of(on, row, t, ω, r, n_perp)
     with dr.resume_grad():
-        v = mi.Vector3f(tangents(table.displacement(sight.at)))
+        v = mi.Vector3f(tangents(table.displacement(sight.at, ω)))
     n, _, silhouette = table.ask(row, lambda kind, own_row, own: kind.open_side(own_row, on.dx, ω, own))
 
     active = (across > 0) & (r > on.lead) & ((dr.dot(n_perp, v - u) != 0) | sources_move(job.facts))
