@@ -10,11 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .near_pairs import near_pairs
 from .topology import INVALID
 
-#: Pairs of an edge and a triangle that are tested at once (memory), and in all (time) for one pair of meshes.
+#: Pairs of an edge and a triangle that are tested at once (memory), up to which all are tested, and in all (time) for
+#: one pair of meshes.
 CHUNK = 1 << 18
-MAX_TESTS = 1 << 24
+ALL_PAIRS = 1 << 24
+MAX_TESTS = 1 << 26
 
 #: Surfaces closer than this, relative to their coordinates, rest on each other: their own edges are what is seen.
 RESTING = 1e-5
@@ -92,10 +95,11 @@ def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.n
 def _pierced(own: TriangleMesh, other: TriangleMesh, box: np.ndarray, tol: float):
     """Edges of `own` through faces of `other`: `(edge, face, point)`."""
     edge, face = _in_box(own.positions, own.edges, box), _in_box(other.positions, other.faces, box)
-    if len(edge) * len(face) > MAX_TESTS:
-        raise TooManyPairs
     ends = own.positions[own.edges[edge]].astype(float)
     corners = other.positions[other.faces[face]].astype(float)
+    if len(edge) * len(face) > ALL_PAIRS:
+        e, f, x = _near_crossings(ends, corners, tol)
+        return edge[e], face[f], x
     found = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))]
     step = max(1, CHUNK // max(len(face), 1))
     for i in range(0, len(edge), step):
@@ -117,6 +121,25 @@ def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
     weights = barycentric(x, corners[f])
     inside = weights.min(1) >= -1e-9
     return e[inside], f[inside], x[inside]
+
+
+def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
+    """The same for many segments and triangles: only pairs whose boxes overlap are tested."""
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    level = np.einsum("ij,ij->i", n, corners[:, 0])
+    found, tests = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))], 0
+    for e, f in near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1)):
+        tests += len(e)
+        if tests > MAX_TESTS:
+            raise TooManyPairs
+        d0, d1 = (np.einsum("ij,ij->i", ends[e, k], n[f]) - level[f] for k in (0, 1))
+        through = (d0 * d1 < 0) & (np.minimum(np.abs(d0), np.abs(d1)) > tol)
+        e, f, d0, d1 = e[through], f[through], d0[through], d1[through]
+        x = ends[e, 0] + (d0 / (d0 - d1))[:, None] * (ends[e, 1] - ends[e, 0])
+        inside = barycentric(x, corners[f]).min(1) >= -1e-9
+        found.append((e[inside], f[inside], x[inside]))
+    return tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
 
 def barycentric(x: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks import meshes
 from psdr_jit.edges import intersections as cut
+from psdr_jit.edges.near_pairs import near_pairs
 from psdr_jit.edges.topology import build_edge_topology
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
@@ -77,6 +79,7 @@ def test_two_cubes():
 
 
 def test_too_dense(monkeypatch):
+    monkeypatch.setattr(cut, "ALL_PAIRS", 0)
     monkeypatch.setattr(cut, "MAX_TESTS", 10)
     with pytest.raises(cut.TooManyPairs):
         cut.mesh_mesh(mesh(CUBE, CUBE_FACES), mesh(CUBE + 0.5, CUBE_FACES))
@@ -102,3 +105,29 @@ def test_ball_over_the_border_of_a_floor():
 
 def test_touching_ball():
     assert len(cut.ball_mesh(np.array([0, 0.8, 0]), 0.8, mesh(SQUARE, SQUARE_FACES), 64).face) == 0
+
+
+@pytest.mark.parametrize("spread", [0.02, 0.3])
+def test_near_pairs_are_all_that_overlap(spread):
+    """Every pair of overlapping boxes, once, whether they are small or span most of the grid."""
+    rng = np.random.default_rng(7)
+    a, b = (rng.random((n, 3)) for n in (700, 500))
+    size_a, size_b = (spread * rng.random((n, 3)) * rng.random((n, 1)) for n in (700, 500))
+    parts = list(near_pairs(a, a + size_a, b, b + size_b))
+    i, j = (np.concatenate(column) for column in zip(*parts, strict=True))
+    expected = np.all((a[:, None] <= b + size_b) & (b <= (a + size_a)[:, None]), axis=2)
+    assert len(i) == expected.sum()
+    assert expected[i, j].all() and len(set(zip(i.tolist(), j.tolist(), strict=True))) == len(i)
+
+
+def test_two_fine_balls():
+    """Too many edges and faces to test them all: the circle of two unit balls at a distance of 1.2."""
+    points, faces = meshes.ball(64, 128)
+    unit = (points - meshes.CENTRE) / meshes.RADIUS
+    turned = unit @ rotation(np.random.default_rng(3)).T + [1.2, 0, 0]
+    a, b = mesh(unit, faces), mesh(turned, faces)
+    assert len(a.edges) * len(b.faces) / 4 > cut.ALL_PAIRS
+    found = cut.mesh_mesh(a, b)
+    # segments of which an end is within the tolerance of a corner are left out: 1.4 % at this fineness
+    assert length(found) == pytest.approx(2 * np.pi * 0.8, rel=2e-2)
+    assert np.abs(found.start[:, 0] - 0.6).max() < 2e-3
