@@ -142,6 +142,19 @@ def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
     return tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
 
+def cross(a: np.ndarray, b: np.ndarray, tol: float) -> bool:
+    """Does any of the triangles `a` (N, 3, 3) cross any of `b`? True where that would take too many tests."""
+    sides = ((0, 1), (1, 2), (2, 0))
+    try:
+        for own, other in ((a, b), (b, a)):
+            ends = np.concatenate([own[:, side] for side in sides])
+            if len(_near_crossings(ends, other, tol)[0]):
+                return True
+    except TooManyPairs:
+        return True
+    return False
+
+
 def barycentric(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(N, 3) weights of the corners (N, 3, 3) in points of their planes."""
     u, v, w = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], x - corners[:, 0]

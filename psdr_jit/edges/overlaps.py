@@ -10,6 +10,7 @@ import numpy as np
 from ..core.memory import Memory, Slot
 from ..errors import UnsupportedWarning
 from .intersections import RESTING
+from .tessellation import cut_each_other
 
 #: Names of the pairs that have been warned about.
 SAID: Slot[set[tuple[str, str]]] = Slot(set)
@@ -47,17 +48,20 @@ def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
 
 
 def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], memory: Memory) -> None:
-    """Name those of the crossing `pairs` of `(shape, plugin)` whose curve is not looked for, once each."""
+    """Name those of `pairs` of `(shape, plugin)` that cut into each other along a curve that is not looked for, once.
+
+    `pairs`: those whose boxes overlap.
+    """
     for i, j in pairs:
         (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
         covered = not curved or curved == ["sphere"]
         covered |= curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))
         key = (a.id(), b.id())
-        if not covered and key not in memory[SAID]:
+        if not covered and key not in memory[SAID] and cut_each_other(shapes[i], shapes[j]):
             memory[SAID].add(key)
             warnings.warn(
-                f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) may cut into each other: the curve where they "
+                f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) cut into each other: the curve where they "
                 "meet is found for meshes and for a sphere in a mesh only, its part of the derivative is missing; "
                 "replace curved shapes by meshes",
                 UnsupportedWarning,

@@ -73,3 +73,26 @@ def test_covered_pairs_are_not_named(llvm):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_about_pairs(found, pairs_of(found), Memory())
+
+
+@pytest.mark.parametrize(("height", "count"), [(0.72, 0), (0.6, 1), (-0.5, 1)])
+def test_a_tilted_disk_over_a_ball(llvm, height, count):
+    """Their boxes overlap whether the disk, which leans by 45 degrees, cuts into the ball or not."""
+    T = mi.ScalarTransform4f
+    lean = T().translate([height, 0, height]).rotate([0, 1, 0], 45)
+    found = shapes(ball=("sphere", T()), disk=("disk", lean))
+    assert pairs_of(found) == [(0, 1)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_about_pairs(found, pairs_of(found), Memory())
+    assert len(caught) == count
+
+
+def test_a_tube_beside_a_corner(llvm):
+    """Inside of the box of a bent mesh, and clear of it."""
+    T = mi.ScalarTransform4f
+    found = shapes(tube=("cylinder", T().translate([0, 0, 0.2]).scale([0.3, 0.3, 0.5])), box=("cube", T()))
+    assert pairs_of(found) == [(0, 1)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_about_pairs(found, pairs_of(found), Memory())
