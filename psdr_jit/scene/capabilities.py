@@ -58,6 +58,9 @@ SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
 """Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
 
+PATTERN_PLUGINS = frozenset({"checkerboard", "bitmap", "mesh_attribute"})
+"""Textures whose steps, if they have any, are edges of their own on surfaces."""
+
 FRAME_FREE_PLUGINS = frozenset({
     "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
     "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",
