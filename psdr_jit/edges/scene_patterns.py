@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, texcoords_buffer
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_values, texcoords_buffer
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
-from ..scene.patterns import pattern_textures, step_families, steps_between_faces, texture_values
+from ..scene.patterns import StepFamily, pattern_textures, step_families, steps_between_faces, texture_values
 from .kind import EdgeKind
 from .kind_pattern import AnalyticPatterns, MeshPatterns, Surface
 from .overlaps import apart
@@ -47,7 +47,8 @@ ENDS = {
 class ShapePatterns:
     """The pattern of one shape, from what `values` were."""
 
-    values: list  # textures, texture coordinates and faces, kept alive so that they can be told from others
+    values: list  # textures and their parameters, kept alive so that they can be told from others
+    buffers: list  # texture coordinates and faces of a mesh
     parts: list[tuple[Lines, dict[str, np.ndarray]]]  # but for the columns that depend on other shapes
     on_sides: mi.Bool | None  # of a mesh, by 3 · face + corner: is there a step along the side opposite to it?
     side: float  # +1: its front is where the normals of its faces by their winding are; −1: the other side; 0: unknown
@@ -77,15 +78,22 @@ def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
         return known
     textures = pattern_textures(shape)
     values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]
-    if facts.is_mesh:
-        values += [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)]
-    if known is None or [_identity(v) for v in known.values] != [_identity(v) for v in values]:
+    buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
+    if known is None or not _unchanged(known, values, buffers):
+        families = [family for texture in textures for family in step_families(texture)]
         if facts.is_mesh:
-            known = _mesh_patterns(shape, textures, values)
+            found = _mesh_patterns(shape, families, steps_between_faces(textures))
         else:
-            known = _analytic_patterns(facts.plugin, textures, values)
+            found = (*_analytic_patterns(facts.plugin, families), 1.0)
+        known = ShapePatterns(values, buffers, *found)
         job.call.memory[PATTERNS][facts.name] = known
     return known
+
+
+def _unchanged(known: ShapePatterns, values: list, buffers: list) -> bool:
+    """A rectangle that moves gets new buffers of the same content."""
+    same = [_identity(v) for v in known.values] == [_identity(v) for v in values]
+    return same and all(same_values(a, b) for a, b in zip(known.buffers, buffers, strict=True))
 
 
 def _identity(value: Any) -> Any:
@@ -99,10 +107,9 @@ def _identity(value: Any) -> Any:
     return value.index if dr.is_jit_v(value) else id(value) if isinstance(value, mi.Object) else value
 
 
-def _mesh_patterns(mesh: mi.Mesh, textures: list[mi.Texture], values: list) -> ShapePatterns:
+def _mesh_patterns(mesh: mi.Mesh, families: list[StepFamily], everywhere: bool) -> tuple:
+    """Columns `parts`, `on_sides` and `side` of `ShapePatterns`; `everywhere`: all edges may be steps."""
     faces = np.array(mesh_faces(mesh)).T
-    families = [family for texture in textures for family in step_families(texture)]
-    everywhere = steps_between_faces(textures)
     if mesh.has_vertex_texcoords():
         uv = np.array(dr.detach(texcoords_buffer(mesh)), float).reshape(-1, 2)[faces]
     else:  # Mitsuba takes the barycentric coordinates of every face
@@ -119,7 +126,7 @@ def _mesh_patterns(mesh: mi.Mesh, textures: list[mi.Texture], values: list) -> S
         parts.append((lines, rows))
     on_sides = np.full((len(faces), 3), True) if everywhere else sides_on_lines(uv, found)
     on_device = uploaded(mi.Bool, on_sides) if on_sides.any() else None
-    return ShapePatterns(values, parts, on_device, _front(mesh))
+    return parts, on_device, _front(mesh)
 
 
 def _face_patches(uv: np.ndarray) -> Patches:
@@ -152,8 +159,8 @@ def _front(mesh: mi.Mesh) -> float:
         return float(dr.sign(dr.dot(n, dr.cross(p1 - p0, p2 - p0)))[0])
 
 
-def _analytic_patterns(plugin: str, textures: list[mi.Texture], values: list) -> ShapePatterns:
-    families = [family for texture in textures for family in step_families(texture)]
+def _analytic_patterns(plugin: str, families: list[StepFamily]) -> tuple:
+    """Columns `parts` and `on_sides` of `ShapePatterns`."""
     nu, nv = ANALYTIC_GRID[plugin]
     u, v = (a.ravel() for a in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
     corner = np.stack([u, v], 1)[:, None]
@@ -165,7 +172,7 @@ def _analytic_patterns(plugin: str, textures: list[mi.Texture], values: list) ->
         rows = rows_on(patches, None, lines, np.broadcast_to(lines.n, (len(uv), 2)))
         rows |= {f"v{i}": np.zeros(len(rows["part"])) for i in range(3)}
         parts.append((lines, rows))
-    return ShapePatterns(values, parts, None, 1.0)
+    return parts, None
 
 
 def pattern_kinds(
@@ -185,7 +192,7 @@ def pattern_kinds(
         lines = _table(job.call.memory, is_mesh, found, offsets)
         if lines is None:
             continue
-        moves = dr.gather(mi.Bool, mi.Bool([s.moves for s in chosen]), lines.rows.shape)
+        moves = dr.gather(mi.Bool, uploaded(mi.Bool, np.array([s.moves for s in chosen])), lines.rows.shape)
         front, back = _seen_sides(job, chosen, found, lines)
         pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
         common = (lines, moves, front, back, pointers, centre)
@@ -235,8 +242,8 @@ def _seen_sides(
     shell = dr.concat(shells)
     rows = lines.rows
     part = rows.part if any(facts.is_mesh for facts in chosen) else mi.UInt32(0)
-    closed = dr.gather(mi.Float, shell, dr.gather(mi.UInt32, mi.UInt32(firsts), rows.shape) + part)
-    side = dr.gather(mi.Float, mi.Float(sides), rows.shape)
+    closed = dr.gather(mi.Float, shell, dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(firsts)), rows.shape) + part)
+    side = dr.gather(mi.Float, uploaded(mi.Float, np.array(sides)), rows.shape)
     front = dr.select((closed < 0) | (side < 0), mi.Float(0), 1)
     back = dr.select((closed > 0) | (side > 0), mi.Float(0), 1)
     dr.eval(front, back)
