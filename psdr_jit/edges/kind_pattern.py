@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
 from .curves import attached_to_world, transform_point, transform_vector
-from .film_cover import LEAST_LENGTH, LENS_CENTRE, lens_reach, overlaps_film
+from .film_cover import LEAST_LENGTH, LENS_CENTRE, beside_film, lens_reach, overlaps_film
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
@@ -83,8 +83,9 @@ class PatternLines(FixedKind):
     moves: mi.Bool  # by row
     front: mi.Float  # by row: may it be seen from the side of its normals (`_normal`)? 0 or 1
     back: mi.Float  # by row: and from the other one?
-    shapes: mi.ShapePtr
+    pointers: mi.ShapePtr  # by PatternRows.shape
     centre: mi.Point3f  # of the scene
+    shapes: tuple[mi.Shape, ...]
 
     @abstractmethod
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
@@ -127,11 +128,11 @@ class PatternLines(FixedKind):
         margin = dr.norm(high - low) / 4 + dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
         length = dr.clip(self._mean_length(lambda x: look_at(frame, x, lens).p), LEAST_LENGTH, film)
         length = dr.select(whole, dr.select(overlaps_film(frame, low, high, margin, border), length, 0), film)
-        hidden = (farthest <= frame.near) | self._turned_away(frame, corners)
+        hidden = (farthest <= frame.near) | self._unseen(frame, corners, border)
         return dr.select(hidden, 0, mi.Float(rows.count) * length)
 
-    def _turned_away(self, frame: SensorFrame, corners: list[mi.Point3f]) -> mi.Bool:
-        """By row: certainly seen from a side from which it is never seen, for every point of the lens."""
+    def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
+        """By row: certainly beside the film, or turned away, for every point of the lens."""
         return mi.Bool(False)
 
     def line_weights(self, use: Use) -> mi.Float:
@@ -192,7 +193,6 @@ class PatternLines(FixedKind):
 class MeshPatterns(PatternLines):
     """On faces of meshes; q are barycentric coordinates (b1, b2), as Mitsuba's `prim_uv`."""
 
-    meshes: tuple[mi.Mesh, ...]
     positions: mi.Point3f  # of all vertices, detached
 
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
@@ -200,15 +200,16 @@ class MeshPatterns(PatternLines):
         return SurfacePoint(mi.Point3f(p0 + q.x * e1 + q.y * e2), e1, e2)
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        p0, e1, e2 = _face(attached_positions(self.meshes), rows, active)
+        p0, e1, e2 = _face(attached_positions(self.shapes), rows, active)
         return mi.Point3f(p0 + q.x * e1 + q.y * e2)
 
-    def _turned_away(self, frame: SensorFrame, corners: list[mi.Point3f]) -> mi.Bool:
+    def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         view = towards_viewer(viewpoint(frame, mi.Point2f(LENS_CENTRE)), corners[0])
         _, e1, e2 = _face(self.positions, self.lines.rows, mi.Bool(True))
         cos = facing(mi.Normal3f(dr.normalize(dr.cross(e1, e2))), view)
         slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
-        return ((self.front == 0) | (cos <= -slack)) & ((self.back == 0) | (cos >= slack))
+        away = ((self.front == 0) | (cos <= -slack)) & ((self.back == 0) | (cos >= slack))
+        return away | beside_film(frame, corners, border)
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """The same face, as if the viewer had looked at it: nothing is traced."""
@@ -217,7 +218,7 @@ class MeshPatterns(PatternLines):
         pi.valid = active
         pi.t = dr.select(active, sight.r, dr.inf)
         pi.prim_index, pi.prim_uv = rows.part, q
-        pi.shape = dr.gather(mi.ShapePtr, self.shapes, rows.shape, active)
+        pi.shape = dr.gather(mi.ShapePtr, self.pointers, rows.shape, active)
         return Side(mi.Ray3f(sight.viewer, sight.ω), pi, mi.Bool(False), mi.Bool(True), mi.Bool(True))
 
 
@@ -237,25 +238,26 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True)
 class AnalyticPatterns(PatternLines):
-    """On disks, cylinders and spheres; q are the texture coordinates."""
+    """On disks, cylinders and spheres; q are the texture coordinates.
 
-    owners: tuple[mi.Shape, ...]
+    Normals differ along a row: lines are drawn in all directions, `front` and `back` are 1.
+    """
+
+    closed: mi.Bool  # by row: a sphere whose inside is never seen
 
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        columns = tuple(dr.detach(c) for c in attached_to_world(self.owners, rows.shape))
+        columns = tuple(dr.detach(c) for c in attached_to_world(self.shapes, rows.shape))
         x, du, dv = surface_point(rows.part, q)
-        return SurfacePoint(
-            transform_point(columns, x), transform_vector(columns, du), transform_vector(columns, dv)
-        )  # fmt: skip
+        return SurfacePoint(transform_point(columns, x), *(transform_vector(columns, d) for d in (du, dv)))
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        return transform_point(attached_to_world(self.owners, rows.shape), surface_point(rows.part, q)[0])
+        return transform_point(attached_to_world(self.shapes, rows.shape), surface_point(rows.part, q)[0])
 
-    def _turned_away(self, frame: SensorFrame, corners: list[mi.Point3f]) -> mi.Bool:
+    def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         """The far side of a sphere of which the inside is never seen."""
         rows, eye = self.lines.rows, viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        centre = mi.Point3f(dr.detach(attached_to_world(self.owners, rows.shape)[3]))
-        away = (rows.part == int(Surface.SPHERE)) & (self.back == 0)
+        centre = mi.Point3f(dr.detach(attached_to_world(self.shapes, rows.shape)[3]))
+        away = mi.Bool(self.closed)
         for x in corners:
             n, view = dr.normalize(x - centre), towards_viewer(eye, x)
             slack = frame.aperture if frame.kind == "thinlens" else 0.0

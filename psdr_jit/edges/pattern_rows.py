@@ -21,6 +21,9 @@ from ..scene.patterns import StepFamily
 #: Lines of a row at most: their common parameter t is a float, of which each keeps 18 bits.
 BLOCK = 32
 
+#: Parallel lines of one texture on one shape, at most.
+MOST_LINES = 2**20
+
 #: Sine of the angle below which two families of lines count as parallel.
 PARALLEL = 1e-6
 
@@ -117,6 +120,11 @@ def _ended(n: np.ndarray, s: np.ndarray, ends: tuple[End, ...]) -> np.ndarray:
     for place, _ in own:
         s = s[np.abs(s - place) > tolerance]
     return np.sort(np.append(s, [place for place, seam in own if seam]))
+
+
+def too_fine(family: StepFamily, uv: np.ndarray) -> bool:
+    """Has it more lines among the points `uv` (N, 2) than anyone could see?"""
+    return float(np.ptp(uv @ family.a)) > MOST_LINES
 
 
 def _across(family: StepFamily, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

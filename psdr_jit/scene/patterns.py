@@ -92,7 +92,7 @@ def _checkers(texture: mi.Texture, to_uv: np.ndarray) -> list[StepFamily]:
 
 
 def _texels(texture: mi.Texture, to_uv: np.ndarray) -> list[StepFamily]:
-    data = np.array(mi.traverse(texture)["data"], float)
+    data = np.array(dr.detach(mi.traverse(texture)["data"]), float)
     data = data.reshape(*data.shape[:2], -1)
     mode = _wrap_mode(texture, to_uv, data.shape[1], data.shape[0])
     families = []
