@@ -75,7 +75,7 @@ def sheet(texture: dict, uv, segments: int = 2, colours: bool = False) -> mi.Mes
 def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int = 1024, **options):
     motion = perturb(scene, param, **how)
     spec = {"type": "psdr_path", "max_depth": 2, **options}
-    reference = fd(motion, spec, STEP if "direction" in how else TURN, 2 * seeds, 2 * spp)
+    reference = fd(motion, spec, STEP if "direction" in how else TURN, 4 * seeds, 2 * spp)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         slope = gain(forward(motion, spec, seeds, spp), reference[0::2], reference[1::2])
