@@ -103,12 +103,11 @@ def test_turned_texture_coordinates(llvm, mode):
     assert_gain(scene_of(painted(texture)), "thing.to_world", TURNED)
 
 
-@pytest.mark.parametrize("plugin, size", [
-    ("sphere", 1), pytest.param("cylinder", 0.7, marks=slow), pytest.param("disk", 2, marks=slow),
-])  # fmt: skip
+@slow
+@pytest.mark.parametrize("plugin, size", [("sphere", 1), ("cylinder", 0.7), ("disk", 2)])
 @pytest.mark.parametrize("texture, how", [
     pytest.param(lambda: texels(6, 7, **TURNED_UV), TURNED, id="texels-turned"),
-    pytest.param(lambda: checkerboard(8), MOVED, id="checkerboard-moved", marks=slow),
+    pytest.param(lambda: checkerboard(8), MOVED, id="checkerboard-moved"),
 ])  # fmt: skip
 def test_shapes_without_triangles(llvm, plugin, size, texture, how):
     """The disk is larger than the picture."""
