@@ -44,6 +44,13 @@ def mesh_buffers(mesh: mi.Mesh) -> tuple:
             mesh.faces_buffer())  # fmt: skip
 
 
+def texcoords_buffer(mesh: mi.Mesh) -> mi.Float:
+    """The array that holds the texture coordinates of the vertices, replaced whenever they change; may be empty."""
+    if not INDEXED_MESHES:
+        return mesh.vertex_texcoords_buffer()
+    return _parameter(mesh, VERTEX_TEXCOORDS).array if mesh.has_vertex_texcoords() else mi.Float()
+
+
 def mesh_faces(mesh: mi.Mesh) -> mi.Vector3u:
     """Corner indices (F) into `mesh_positions`."""
     if not INDEXED_MESHES:
@@ -58,6 +65,11 @@ def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
 
 def same_faces(a: mi.UInt32, b: mi.UInt32) -> bool:
     """Do two arrays of corner indices agree? At once if they are one array."""
+    return same_values(a, b)
+
+
+def same_values(a: mi.UInt32 | mi.Float, b: mi.UInt32 | mi.Float) -> bool:
+    """Do two flat arrays agree? At once if they are one array."""
     return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
 
 

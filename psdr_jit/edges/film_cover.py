@@ -41,6 +41,25 @@ def overlaps_film(frame: SensorFrame, a: mi.Point2f, b: mi.Point2f, margin: mi.F
     return inside
 
 
+def beside_film(frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
+    """Are flat patches beside the view of a pinhole, though some of their corners may lie behind it?
+
+    On each side of the film the view ends in a plane through the pinhole: all corners are beyond the same one. False
+    for other sensors.
+    """
+    if frame.kind != "perspective":
+        return mi.Bool(False)
+    local = [frame.to_local @ x for x in corners]
+    beside = mi.Bool(False)
+    for axis in range(2):
+        film = [(q[axis] - frame.corner[axis] * q.z) / frame.extent[axis] for q in local]  # times the depth
+        margin = border / frame.crop_size[axis]
+        for beyond in ([f < -margin * q.z for f, q in zip(film, local, strict=True)],
+                       [f > (1 + margin) * q.z for f, q in zip(film, local, strict=True)]):  # fmt: skip
+            beside |= beyond[0] & beyond[1] & beyond[2]
+    return beside
+
+
 @dataclass
 class EdgeOnFilm:
     """Which way the faces of an edge turn, by row; conservative for every point of a lens."""

@@ -30,6 +30,7 @@ from .kind_mesh import MeshEdges
 from .kind_shading import ShadingOutlines
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
+from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import smooth_faces
 from .table import EdgeTable
@@ -63,20 +64,23 @@ def edge_table(job: Job) -> EdgeTable:
     if curves is not None:
         kinds.append(curves)
     kinds += _shading_outlines(job, meshes, centre)
+    kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)
 
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
     """Edges of the meshes; kept from call to call while every shape rests."""
     shapes = [job.scene.shapes()[s.index] for s in meshes]
+    seams = [None if p is None else p.on_sides for p in patterns_of(job, meshes)]
     if job.facts.shapes_move or balls or not job.plan.prunes:
-        return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls)
+        return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls, seams)
     buffers = [buffer for shape in shapes for buffer in mesh_buffers(shape)]
+    buffers += [on_sides for on_sides in seams if on_sides is not None]
     known = job.call.memory[RESTING]
     # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
     same = known is not None and [b.index for b in known[0]] == [b.index for b in buffers]
     if not same:
-        known = (buffers, edge_set(shapes, [False] * len(shapes), job.call.memory))
+        known = (buffers, edge_set(shapes, [False] * len(shapes), job.call.memory, seams=seams))
         job.call.memory[RESTING] = known
     return replace(known[1], meshes=tuple(shapes))
 

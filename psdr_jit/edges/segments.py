@@ -59,11 +59,18 @@ class EdgeSet:
     junctions: JunctionTable | None  # curves along which the meshes cut into each other, or balls into them
 
 
-def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: tuple[Ball, ...] = ()) -> EdgeSet:
+def edge_set(
+    meshes: list[mi.Mesh],
+    moving: list[bool],
+    memory: Memory,
+    balls: tuple[Ball, ...] = (),
+    seams: list[mi.Bool | None] | None = None,
+) -> EdgeSet:
     """Edges of `meshes` in their present state; topologies are kept in `memory` from call to call.
 
     Intersection curves of meshes with each other and with `balls` have rows of their own. Coinciding edges of shapes
-    that all move, or all rest (`moving`), become one row: `join_coinciding`.
+    that all move, or all rest (`moving`), become one row: `join_coinciding`. `seams`: by mesh, the sides of faces along
+    which a pattern steps, 3 · face + opposite corner; None for meshes without.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
@@ -74,7 +81,10 @@ def edge_set(meshes: list[mi.Mesh], moving: list[bool], memory: Memory, balls: t
         faces = mesh_faces(mesh)
         dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
         topology = _cached_topology(mesh, positions, faces, memory)
-        parts.append(_rows(mesh, positions, faces, topology, i, first_vertex, moving[i]))
+        jumps = _jumps(mesh, faces, topology.device)
+        if seams is not None and seams[i] is not None:
+            jumps |= _on_sides(seams[i], topology.device)
+        parts.append(_rows(mesh, (positions, faces), topology, jumps, i, first_vertex, moving[i]))
         solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
         first_vertex += dr.width(positions)
     rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
@@ -175,11 +185,18 @@ def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
     return found
 
 
-def _rows(mesh, positions, faces, topology: MeshTopology, shape: int, first_vertex: int, moves: bool) -> EdgeRows:
-    topo = topology.device
+def _on_sides(sides: mi.Bool, topo: EdgeTopologyDevice) -> mi.Bool:
+    """Edges that are among the `sides` of one of their faces (3 · face + opposite corner)."""
+    side0, side1 = 3 * topo.f0 + topo.apex0, 3 * topo.f1 + topo.apex1
+    return dr.gather(mi.Bool, sides, side0) | dr.gather(mi.Bool, sides, side1)
+
+
+def _rows(
+    mesh, geometry: tuple, topology: MeshTopology, jumps: mi.Bool, shape: int, first_vertex: int, moves: bool
+) -> EdgeRows:
+    (positions, faces), topo = geometry, topology.device
     g = edge_geometry(positions, faces, topo)
     n = dr.width(topo.v0)
-    jumps = _jumps(mesh, faces, topo)
     return EdgeRows(
         v0=topo.v0 + first_vertex,
         v1=topo.v1 + first_vertex,

@@ -58,6 +58,9 @@ SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
 """Discontinuous by construction; a bump map's normals step at texel borders even if its heights do not."""
 
+PATTERN_PLUGINS = frozenset({"checkerboard", "bitmap", "mesh_attribute"})
+"""Textures whose steps, if they have any, are edges of their own on surfaces."""
+
 FRAME_FREE_PLUGINS = frozenset({
     "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
     "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",
@@ -108,8 +111,8 @@ SUPPORT = (
         "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
     Row("blendbsdf of a smooth and a perfectly specular material", "error",
         "Mitsuba does not report its sampling density"),
-    Row("checkerboard, nearest-neighbour bitmap, bump map, face attributes", "warning",
-        _MOVING + "steps inside a surface may slide and are not sampled"),
+    Row("checkerboard, nearest-neighbour bitmap, face attributes", "yes", "where texture coordinates move: warning"),
+    Row("bump map", "warning", _MOVING + "its normals step at texel borders, which may slide and are not sampled"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),

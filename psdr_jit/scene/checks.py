@@ -190,10 +190,16 @@ def check_extent(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_surface_steps(facts: SceneFacts) -> Iterator[Finding]:
-    """Steps inside a surface slide along it as soon as a ray does, and no edge covers them."""
+    """Steps inside a surface slide along it as soon as a ray does, and not all of them are edges."""
     for shape in facts.shapes:
         if shape.jumps and (facts.geometry_moves or VERTEX_TEXCOORDS in shape.shading):
             yield _missing_steps(shape.name, f"shape '{shape.name}'", shape.jumps)
+        if shape.patterns and VERTEX_TEXCOORDS in shape.shading:
+            yield Finding(
+                UnsupportedWarning, shape.name,
+                f"shape '{shape.name}' has steps inside its surface ({', '.join(shape.patterns)}), which slide "
+                "with its texture coordinates: this part of the derivative is missing; use smooth textures",
+            )  # fmt: skip
     for emitter in facts.emitters:
         if emitter.jumps and (facts.geometry_moves or _uv_moves(facts.shapes, emitter.shape)):
             yield _missing_steps(emitter.name, f"emitter '{emitter.name}' ({emitter.plugin})", emitter.jumps)
@@ -207,7 +213,7 @@ def _missing_steps(subject: str, label: str, jumps: tuple[str, ...]) -> Finding:
     return Finding(
         UnsupportedWarning, subject,
         f"{label} has steps inside its surface ({', '.join(jumps)}): where they slide, their part of the "
-        "derivative is missing; use a bitmap with filter_type=bilinear, or split the surface along the steps",
+        "derivative is missing; use a smooth texture or material in their place",
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from .graph import (
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
+from .patterns import missing_patterns
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class ShapeFacts:
     delta_weights: tuple[str, ...]  # enabled parameters that scale or steer a delta lobe, full names
     delta_varies: bool  # such a parameter, enabled or not, varies over the surface
     blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
-    jumps: tuple[str, ...]  # what is discontinuous inside the surface, "checkerboard 'floor'", ...
+    patterns: tuple[str, ...]  # textures that step inside the surface, "checkerboard 'floor'", ...
+    jumps: tuple[str, ...]  # whatever else is discontinuous inside the surface
     sees_frame: bool  # its BSDF depends on how the shading frame is turned about the normal
     geometry: tuple[str, ...]  # parameters that move the surface
     shading: tuple[str, ...]  # vertex normals, texture coordinates and attributes
@@ -78,7 +80,7 @@ class EmitterFacts:
     infinite: bool
     varies: bool  # what is seen of it directly differs from point to point or with the direction
     hard_edge: bool  # a spot whose cone has no soft rim
-    jumps: tuple[str, ...]  # discontinuous textures
+    jumps: tuple[str, ...]  # discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
     pose: tuple[str, ...]  # enabled parameters that move it
     radiance: tuple[str, ...]  # all other enabled parameters
 
@@ -202,6 +204,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
     shading = tuple(name for name in enabled if _only_shades(name))
+    jumps, glow = jumping_textures(graph, bsdf), jumping_textures(graph, shape.emitter())
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
     if plugin in UNSUPPORTED_SHAPES:
         kind = "unsupported"
@@ -228,7 +231,8 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_weights=delta_weights,
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
-        jumps=jumping_textures(graph, bsdf),
+        patterns=tuple(dict.fromkeys(j for j in jumps + glow if j not in missing_patterns(jumps + glow))),
+        jumps=missing_patterns(jumps),
         sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),
@@ -248,6 +252,7 @@ def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: l
     flags = emitter.flags()
     owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
     name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
+    jumps = jumping_textures(graph, emitter)
     return EmitterFacts(
         name=name,
         plugin=plugin_name(emitter),
@@ -256,7 +261,7 @@ def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: l
         infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
         varies=plugin_name(emitter) not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
         hard_edge=is_hard_edged(graph, emitter),
-        jumps=jumping_textures(graph, emitter),
+        jumps=missing_patterns(jumps) if owners and plugin_name(emitter) == "area" else jumps,
         pose=pose,
         radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
     )

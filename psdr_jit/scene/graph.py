@@ -202,8 +202,7 @@ def jumping_textures(graph: SceneGraph, owner: mi.Object | None) -> tuple[str, .
     found = {}
     for node in graph.walk(owner, skip=(mi.Shape,)):
         plugin = plugin_name(node)
-        stepped = isinstance(node, mi.Texture) and _is_piecewise_constant(node, plugin)
-        if stepped or plugin in JUMPING_PLUGINS:
+        if plugin in JUMPING_PLUGINS or (isinstance(node, mi.Texture) and is_piecewise_constant(node, plugin)):
             found[f"{plugin} '{node.id()}'" if node.id() else plugin] = None
     return tuple(found)
 
@@ -215,7 +214,7 @@ def sees_frame(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
     return turned or any(plugin_name(node) not in FRAME_FREE_PLUGINS for node in known)
 
 
-def _is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
+def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
     """Whether a texture varies over the surface and yet has no derivative with respect to the position.
 
     That is what `filter_type=nearest` means, which neither traversal nor `to_string` reveals. The value is

@@ -15,6 +15,7 @@ from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
+from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
 from psdr_jit.edges.kind_shading import ShadingOutlines
 from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.scene import io as scene_io
@@ -27,6 +28,8 @@ PLACES = {  # kind: a scene that has it, and what moves there
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
     AnalyticCurves: ("ball_shadow", ["blocker.to_world"]),
     ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
+    MeshPatterns: ("patterns", ["floor.to_world"]),
+    AnalyticPatterns: ("patterns", ["ball.to_world"]),
 }
 
 

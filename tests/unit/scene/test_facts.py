@@ -218,9 +218,22 @@ def test_textures_with_steps(texture, steps, name):
     for argument, expected in steps.items():
         ball = {**BALL, "bsdf": {"type": "diffuse", "reflectance": texture(argument)}}
         facts = facts_of(load(ball=ball), "ball.to_world")
-        assert bool(named(facts, "ball").jumps) == expected, argument
-        assert complaints(facts) == ([(UnsupportedWarning, "ball")] if expected else [])
-        assert not complaints(facts_of(load(ball=ball), NOTHING_MOVES))
+        assert bool(named(facts, "ball").patterns) == expected, argument
+        assert not named(facts, "ball").jumps and not complaints(facts)
+
+
+def test_only_steps_that_are_no_edges_are_warned_about():
+    ball = {**BALL, "bsdf": {"type": "bumpmap", "arbitrary": bitmap("bilinear"), "bsdf": {"type": "diffuse"}}}
+    scene = load(ball=ball)
+    assert complaints(facts_of(scene, "ball.to_world")) == [(UnsupportedWarning, "ball")]
+    assert not complaints(facts_of(load(ball=ball), NOTHING_MOVES))
+
+
+def test_patterns_of_what_glows():
+    """On the shape, where they are seen; a light that carries one elsewhere is warned about."""
+    ball = {**BALL, "emitter": {"type": "area", "radiance": bitmap("nearest", raw=True)}}
+    facts = facts_of(load(ball=ball), "ball.to_world")
+    assert named(facts, "ball").patterns and not complaints(facts)
 
 
 # What is refused and what is let through
@@ -411,13 +424,13 @@ def test_several_obstacles_come_in_one_message():
 
 
 def test_a_warning_is_shown_once():
-    floor = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
-    facts = facts_of(load(tiles=floor), "tiles.to_world")
+    bumps = {"type": "bumpmap", "arbitrary": bitmap("bilinear"), "bsdf": {"type": "diffuse"}}
+    facts = facts_of(load(tiles={"type": "rectangle", "bsdf": bumps}), "tiles.to_world")
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
         for _ in range(3):
             require_supported(facts)
-    assert len(shown) == 1 and "checkerboard" in str(shown[0].message)
+    assert len(shown) == 1 and "bumpmap" in str(shown[0].message)
 
 
 def test_unsound_meshes_are_named_with_their_number():

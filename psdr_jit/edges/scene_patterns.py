@@ -1,0 +1,192 @@
+"""The patterns of a scene as kinds of edges.
+
+Which lines cross which patches depends on texture coordinates and textures alone: it is kept while shapes move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, same_values, texcoords_buffer
+from ..core.memory import Memory, Slot
+from ..core.sensor_frame import origin_box
+from ..core.upload import uploaded
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+from ..plan.job import Job
+from ..scene.facts import ShapeFacts
+from ..scene.patterns import StepFamily, pattern_textures, step_families, steps_between_faces, texture_values
+from .kind import EdgeKind
+from .kind_pattern import AnalyticPatterns, MeshPatterns
+from .overlaps import apart
+from .pattern_rows import MOST_LINES, PatternSet, pattern_set, too_fine
+from .pattern_shapes import ShapePatterns, analytic_patterns, mesh_patterns, texture_reach
+from .segments import TOPOLOGIES, attached_positions
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The patterns of a shape, and what they were made from, kept alive so that it can be told from something else."""
+
+    values: list  # textures and their parameters
+    buffers: list  # texture coordinates and faces of a mesh
+    patterns: ShapePatterns
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Patterns of several shapes in one table."""
+
+    found: list[ShapePatterns | None]
+    offsets: list[int]  # of their vertices
+    lines: PatternSet | None
+
+
+#: Of an integrator: patterns by name of the shape.
+PATTERNS: Slot[dict[str, _Known]] = Slot(dict)
+
+#: Of an integrator: the tables last made, of meshes (True) and of other shapes.
+TABLES: Slot[dict[bool, _Table]] = Slot(dict)
+
+
+def patterns_of(job: Job, chosen: list[ShapeFacts]) -> list[ShapePatterns | None]:
+    """The patterns of shapes, None for those without; kept from call to call."""
+    return [_shape_patterns(job, facts) if facts.patterns else None for facts in chosen]
+
+
+def pattern_kinds(
+    job: Job, meshes: list[ShapeFacts], analytic: list[ShapeFacts], centre: mi.Point3f
+) -> tuple[EdgeKind, ...]:
+    """The patterns of all shapes as kinds of edges; none where there are no lines."""
+    kinds: list[EdgeKind] = []
+    for chosen, are_meshes in ((meshes, True), (analytic, False)):
+        if not any(facts.patterns for facts in chosen):
+            continue
+        shapes, found = [job.scene.shapes()[facts.index] for facts in chosen], patterns_of(job, chosen)
+        lines = _lines(job.call.memory, found, shapes, are_meshes)
+        if lines is None:
+            continue
+        moves = dr.gather(mi.Bool, uploaded(mi.Bool, np.array([facts.moves for facts in chosen])), lines.rows.shape)
+        front, back = _seen_sides(job, chosen, found, lines)
+        pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
+        common = (pointers, centre, tuple(shapes))
+        if are_meshes:
+            positions = dr.detach(attached_positions(tuple(shapes)))
+            dr.eval(moves, front, back, positions)
+            kinds.append(MeshPatterns(lines, moves, front, back, *common, positions))
+        else:
+            closed, either = back == 0, dr.full(mi.Float, 1, dr.width(moves))
+            dr.eval(moves, closed)
+            kinds.append(AnalyticPatterns(lines, moves, either, either, *common, closed))
+    return tuple(kinds)
+
+
+def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
+    shape, known = job.scene.shapes()[facts.index], job.call.memory[PATTERNS].get(facts.name)
+    if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
+        return known.patterns
+    textures = pattern_textures(shape)
+    values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]
+    buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
+    if known is None or not _unchanged(known, values, buffers):
+        families = _families(textures, shape, facts, job.call.memory)
+        if facts.is_mesh:
+            patterns = mesh_patterns(shape, families, steps_between_faces(textures))
+        else:
+            patterns = analytic_patterns(facts.plugin, families)
+        known = _Known(values, buffers, patterns)
+        job.call.memory[PATTERNS][facts.name] = known
+    return known.patterns
+
+
+def _unchanged(known: _Known, values: list, buffers: list) -> bool:
+    """A rectangle that moves gets new buffers of the same content."""
+    same = [_identity(v) for v in known.values] == [_identity(v) for v in values]
+    return same and all(same_values(a, b) for a, b in zip(known.buffers, buffers, strict=True))
+
+
+def _identity(value: Any) -> Any:
+    """Equal for two values if they are the same object or array; the other one must be alive."""
+    if hasattr(value, "matrix"):
+        return np.array(value.matrix).tobytes()
+    if dr.is_tensor_v(value):
+        return value.array.index
+    if dr.is_array_v(value) and dr.depth_v(value) > 1:
+        return tuple(_identity(component) for component in value)
+    if isinstance(value, mi.Object):
+        return id(value)
+    return value.index if dr.is_jit_v(value) else value
+
+
+def _families(textures: list[mi.Texture], shape: mi.Shape, facts: ShapeFacts, memory: Memory) -> list[StepFamily]:
+    """The lines of `textures`, but for those that are too many on `shape`."""
+    families, reach = [family for texture in textures for family in step_families(texture)], texture_reach(shape)
+    kept = [family for family in families if not too_fine(family, reach)]
+    if len(kept) < len(families):
+        message = (f"shape '{facts.name}' has more than {MOST_LINES} parallel steps inside its surface "
+                   f"({', '.join(facts.patterns)}): their part of the derivative is missing; use a smaller to_uv, or "
+                   "the mean colour")  # fmt: skip
+        warn_once(message, UnsupportedWarning, memory)
+    return kept
+
+
+def _lines(
+    memory: Memory, found: list[ShapePatterns | None], shapes: list[mi.Shape], are_meshes: bool
+) -> PatternSet | None:
+    """The lines of several shapes in one table, kept while they are the same."""
+    counts = [shape.vertex_count() if are_meshes else 0 for shape in shapes]
+    offsets = [sum(counts[:k]) for k in range(len(shapes))]
+    known = memory[TABLES].get(are_meshes)
+    if known is None or known.offsets != offsets or any(a is not b for a, b in zip(known.found, found, strict=True)):
+        parts = []
+        for k, patterns in enumerate(found):
+            for lines, rows in patterns.parts if patterns is not None else ():
+                corners = {v: rows[v] + offsets[k] for v in ("v0", "v1", "v2")}
+                parts.append((lines, {**rows, **corners, "shape": np.full(len(rows["line"]), k)}))
+        known = _Table(found, offsets, pattern_set(parts))
+        if known.lines is not None:
+            dr.eval(known.lines.rows, known.lines.s, known.lines.inset)
+        memory[TABLES][are_meshes] = known
+    return known.lines
+
+
+def _seen_sides(
+    job: Job, chosen: list[ShapeFacts], found: list[ShapePatterns | None], lines: PatternSet
+) -> tuple[mi.Float, mi.Float]:
+    """By row: can the side of the face that its winding calls the front be seen at all, and the other? 0 or 1.
+
+    Not the inner side of a closed opaque shape that nobody is in, nor the back of a one-sided material.
+    """
+    lower, upper = origin_box(job.frame)
+    fronts, shells, firsts, first = [], [], [], 0
+    for facts, patterns in zip(chosen, found, strict=True):
+        shape = job.scene.shapes()[facts.index]
+        outside = float(facts.opaque and apart(lower, upper, shape.bbox()))
+        one_sided = facts.is_mesh and not facts.smooth and not facts.bsdf_flags & int(mi.BSDFFlags.BackSide)
+        fronts.append(patterns.front if one_sided and patterns is not None else 0.0)
+        closed = _face_shells(shape, job.call.memory) if facts.is_mesh else mi.Float(facts.plugin == "sphere")
+        shells.append(outside * closed)
+        firsts.append(first)
+        first += facts.faces if facts.is_mesh else 1
+    rows, are_meshes = lines.rows, any(facts.is_mesh for facts in chosen)
+    face = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(firsts)), rows.shape)
+    closed = dr.gather(mi.Float, dr.concat(shells), face + rows.part if are_meshes else face)
+    side = dr.gather(mi.Float, uploaded(mi.Float, np.array(fronts)), rows.shape)
+    front = dr.select((closed < 0) | (side < 0), mi.Float(0), 1)
+    return front, dr.select((closed > 0) | (side > 0), mi.Float(0), 1)
+
+
+def _face_shells(mesh: mi.Mesh, memory: Memory) -> mi.Float:
+    """By face: +1 on a closed surface with its normals outward, −1 inward, 0 elsewhere."""
+    shells = dr.zeros(mi.Float, mesh.face_count())
+    known = memory[TOPOLOGIES].get((mesh.id(), mesh.vertex_count(), mesh.face_count()))
+    if known is not None:
+        device = known.device
+        dr.scatter(shells, known.shell * dr.select(device.opposed, 1.0, -1.0), device.f1)
+        dr.scatter(shells, known.shell, device.f0)
+    return shells
