@@ -224,14 +224,15 @@ def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
         return 'name = "face_' in str(texture)
     if not texture.is_spatially_varying():
         return False
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.uv, si.p = mi.Point2f(0.3, 0.4), mi.Point3f(0.3, 0.4, 0.5)
-    dr.enable_grad(si.uv, si.p)
-    for lookup in (texture.eval, texture.eval_3, texture.eval_1):
-        try:
-            return not dr.grad_enabled(lookup(si))
-        except RuntimeError:  # raw data has no spectral value, and coloured data no scalar one
-            continue
+    with dr.resume_grad():  # without derivatives everything would look constant
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.uv, si.p = mi.Point2f(0.3, 0.4), mi.Point3f(0.3, 0.4, 0.5)
+        dr.enable_grad(si.uv, si.p)
+        for lookup in (texture.eval, texture.eval_3, texture.eval_1):
+            try:
+                return not dr.grad_enabled(lookup(si))
+            except RuntimeError:  # raw data has no spectral value, and coloured data no scalar one
+                continue
     return False
 
 

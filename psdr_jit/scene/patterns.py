@@ -1,7 +1,8 @@
 """Steps inside surfaces: which textures of a shape step, and along which lines in its texture coordinates.
 
-A checkerboard steps at multiples of half a period, a bitmap with `filter_type=nearest` at its texel borders, after
-`to_uv`: families of parallel lines a·(u, v) + b = k. Lines across which nothing changes, and textures of one colour,
+A checkerboard steps at multiples of half a period, a bitmap with `filter_type=nearest` at its texel borders, and the
+normals of a bump map, which are the slopes of a bilinear bitmap, at its texel centres, all after `to_uv`: families of
+parallel lines a·(u, v) + b = k. Lines across which nothing changes, and textures of one colour,
 are left out. Plain numbers on the host; nothing here depends on where the surface is.
 """
 
@@ -44,8 +45,8 @@ def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(jump for jump in jumps if jump.split(" ")[0] not in PATTERN_PLUGINS)
 
 
-def pattern_textures(shape: mi.Shape) -> list[mi.Texture]:
-    """The textures that step inside of `shape`, on its BSDF and on its emitter, each once."""
+def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
+    """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
     found, todo = {}, [node for node in (shape.bsdf(), shape.emitter()) if node is not None]
     while todo:
         node = todo.pop()
@@ -56,27 +57,30 @@ def pattern_textures(shape: mi.Shape) -> list[mi.Texture]:
 
 
 def _steps(node: mi.Object, plugin: str) -> bool:
-    if plugin not in PATTERN_PLUGINS or not isinstance(node, mi.Texture):
+    if plugin not in PATTERN_PLUGINS:
         return False
-    return plugin == "checkerboard" or is_piecewise_constant(node, plugin)
+    return plugin in ("checkerboard", "bumpmap") or is_piecewise_constant(node, plugin)
 
 
-def steps_between_faces(textures: list[mi.Texture]) -> bool:
+def steps_between_faces(textures: list[mi.Object]) -> bool:
     """Is one of them an attribute by face, which steps along the edges of a mesh?"""
     return any(plugin_name(texture) == "mesh_attribute" for texture in textures)
 
 
-def texture_values(textures: list[mi.Texture]) -> list:
+def texture_values(textures: list[mi.Object]) -> list:
     """Everything on which `step_families` depends, detached: the same objects while nothing has changed."""
     values = [mi.traverse(texture) for texture in textures]
     return [params[key] for params in values for key, _ in params]
 
 
-def step_families(texture: mi.Texture) -> list[StepFamily]:
-    """Along which lines `texture` steps; empty for attributes of meshes and for textures of one colour."""
+def step_families(texture: mi.Object) -> list[StepFamily]:
+    """Along which lines a texture or bump map steps; empty for attributes of meshes and for textures of one colour."""
     plugin = plugin_name(texture)
     if plugin == "mesh_attribute":
         return []
+    if plugin == "bumpmap":
+        heights = [child for child in child_objects(texture) if plugin_name(child) == "bitmap"]
+        return [family for bitmap in heights for family in _slopes(bitmap)]
     to_uv = np.array(mi.traverse(texture)["to_uv"].matrix, float)[:2]
     return _checkers(texture, to_uv) if plugin == "checkerboard" else _texels(texture, to_uv)
 
@@ -89,6 +93,16 @@ def _checkers(texture: mi.Texture, to_uv: np.ndarray) -> list[StepFamily]:
             return []
     everywhere = np.ones(1, bool)
     return [StepFamily(2 * row[:2], 2 * row[2], everywhere) for row in to_uv]
+
+
+def _slopes(bitmap: mi.Texture) -> list[StepFamily]:
+    """Where the slopes of a bilinear bitmap step. Those of a nearest-neighbour one are 0 for Mitsuba."""
+    if is_piecewise_constant(bitmap, "bitmap"):
+        return []
+    params = mi.traverse(bitmap)
+    to_uv, (height, width) = np.array(params["to_uv"].matrix, float)[:2], dr.shape(params["data"])[:2]
+    everywhere = np.ones(1, bool)
+    return [StepFamily(n * row[:2], n * row[2] - 0.5, everywhere) for n, row in ((width, to_uv[0]), (height, to_uv[1]))]
 
 
 def _texels(texture: mi.Texture, to_uv: np.ndarray) -> list[StepFamily]:

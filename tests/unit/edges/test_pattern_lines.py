@@ -144,3 +144,18 @@ def test_textures_are_found_wherever_they_are_nested(llvm):
     assert sorted(found.class_name().split("[")[0] for found in pattern_textures(shape)) == [
         "BitmapTextureImpl", "Checkerboard",
     ]  # fmt: skip
+
+
+def test_smooth_textures_have_no_lines_while_derivatives_are_suspended(llvm):
+    """As terms ask: a bilinear bitmap beside a checkerboard steps nowhere, as heights of a bump map its slopes do."""
+    data = mi.Bitmap(np.random.default_rng(0).random((4, 6, 1)).astype(np.float32))
+    smooth = {"type": "bitmap", "bitmap": data, "raw": True}
+    blend = {"type": "blendbsdf", "weight": smooth, "a": {"type": "diffuse"},
+             "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}  # fmt: skip
+    bump = {"type": "bumpmap", "heights": smooth, "of": {"type": "diffuse"}}
+    with dr.suspend_grad():
+        shapes = [mi.load_dict({"type": "rectangle", "bsdf": bsdf}) for bsdf in (blend, bump)]
+        assert [len(pattern_textures(shape)) for shape in shapes] == [1, 1]
+        across, down = step_families(pattern_textures(shapes[1])[0])
+    assert np.allclose((across.within(0, 2) - across.b) / across.a[0] * 6, [0.5, 1.5, 2.5])
+    assert np.allclose((down.within(0, 1) - down.b) / down.a[1] * 4, [0.5, 1.5])

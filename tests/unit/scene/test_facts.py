@@ -222,11 +222,20 @@ def test_textures_with_steps(texture, steps, name):
         assert not named(facts, "ball").jumps and not complaints(facts)
 
 
+def grid(filter_type: str) -> dict:
+    """A texture in space."""
+    cells = mi.VolumeGrid(np.random.default_rng(0).random((2, 3, 4, 3)).astype(np.float32))
+    return {"type": "volume", "volume": {"type": "gridvolume", "grid": cells, "filter_type": filter_type, "raw": True}}
+
+
 def test_only_steps_that_are_no_edges_are_warned_about():
-    ball = {**BALL, "bsdf": {"type": "bumpmap", "arbitrary": bitmap("bilinear"), "bsdf": {"type": "diffuse"}}}
+    ball = {**BALL, "bsdf": {"type": "diffuse", "reflectance": grid("nearest")}}
     scene = load(ball=ball)
     assert complaints(facts_of(scene, "ball.to_world")) == [(UnsupportedWarning, "ball")]
     assert not complaints(facts_of(load(ball=ball), NOTHING_MOVES))
+    for bsdf in ({"type": "diffuse", "reflectance": grid("trilinear")},
+                 {"type": "bumpmap", "arbitrary": bitmap("bilinear"), "bsdf": {"type": "diffuse"}}):  # fmt: skip
+        assert not complaints(facts_of(load(ball={**BALL, "bsdf": bsdf}), "ball.to_world"))
 
 
 def test_patterns_of_what_glows():
@@ -424,13 +433,13 @@ def test_several_obstacles_come_in_one_message():
 
 
 def test_a_warning_is_shown_once():
-    bumps = {"type": "bumpmap", "arbitrary": bitmap("bilinear"), "bsdf": {"type": "diffuse"}}
-    facts = facts_of(load(tiles={"type": "rectangle", "bsdf": bumps}), "tiles.to_world")
+    cells = {"type": "diffuse", "reflectance": grid("nearest")}
+    facts = facts_of(load(tiles={"type": "rectangle", "bsdf": cells}), "tiles.to_world")
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
         for _ in range(3):
             require_supported(facts)
-    assert len(shown) == 1 and "bumpmap" in str(shown[0].message)
+    assert len(shown) == 1 and "volume" in str(shown[0].message)
 
 
 def test_unsound_meshes_are_named_with_their_number():
