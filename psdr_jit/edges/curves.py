@@ -47,6 +47,7 @@ class CurveSet:
     """Curves of disks, cylinders and spheres. `rows` is None when there are none."""
 
     shapes: tuple[mi.Shape, ...]
+    pointers: mi.ShapePtr | None  # to `shapes`, for intersections
     rows: CurveRows | None
 
 
@@ -69,9 +70,10 @@ def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
             owner += [i] * PIECES
             start += [piece / PIECES for piece in range(PIECES)]
     if not kind:
-        return CurveSet((), None)
+        return CurveSet((), None, None)
     rows = CurveRows(mi.UInt32(kind), mi.UInt32(owner), mi.Float(start))
-    return CurveSet(tuple(shape for shape, _ in shapes), rows)
+    owners = tuple(shape for shape, _ in shapes)
+    return CurveSet(owners, mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0]), rows)
 
 
 def attached_to_world(shapes: tuple[mi.Shape, ...], index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
@@ -153,3 +155,25 @@ def curve_point(kind: mi.UInt32, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
     dx[ball] = dr.two_pi * radius * (cos * b - sin * a)
     valid &= ~ball | (distance > view.w)
     return CurvePoint(x, dx, outward, valid)
+
+
+def own_surface(kind: mi.UInt32, x: mi.Point3f, ω: mi.Vector3f, turn: mi.Float, inset: mi.Float) -> mi.Point3f:
+    """The point of the shape's own surface that is seen along ω (local) just inside of the curve point `x`. Detached.
+
+    A rim is left by `inset` of the radius of a disk or the length of a tube. A silhouette turns towards the viewer by
+    the angle `turn`, about the tangent of the contour: of the part of ω that is at right angles to a tube's axis.
+    """
+    towards = -mi.Vector3f(ω)
+    on_tube = (kind == int(Curve.CYLINDER_LEFT)) | (kind == int(Curve.CYLINDER_RIGHT))
+    towards.z[on_tube] = 0
+    n = mi.Vector3f(x.x, x.y, dr.select(on_tube, 0, x.z))
+    towards -= dr.dot(towards, n) * n
+    length = dr.norm(towards)
+    towards = dr.select(length > 0, towards / length, 0)
+    sin, cos = dr.sincos(turn)
+    turned = mi.Point3f(x + (cos - 1) * n + sin * towards)
+
+    tube_end = (kind == int(Curve.CYLINDER_BOTTOM)) | (kind == int(Curve.CYLINDER_TOP))
+    along_tube = mi.Point3f(x.x, x.y, dr.select(kind == int(Curve.CYLINDER_TOP), 1 - inset, inset))
+    on_disk = mi.Point3f(x * (1 - inset))
+    return dr.select(tube_end, along_tube, dr.select(kind == int(Curve.DISK_RIM), on_disk, turned))

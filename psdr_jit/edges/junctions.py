@@ -23,6 +23,7 @@ from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
 from . import intersections as cut
 from .overlaps import box_of, crossing
+from .parts import Part, cut_parts
 from .rows import EdgeRows
 from .topology import EdgeTopology
 
@@ -46,6 +47,7 @@ class Solid:
     moves: bool
     topology: EdgeTopology
     shell: mi.Float  # by edge of the topology
+    parts: tuple[Part, ...] = ()  # its connected surfaces, if there are several
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
         state = (_state(a), _state(b))
         known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
-            known = (state, _pair(a, b))
+            known = (state, _within(a) if a is b else _pair(a, b))
             memory[PAIRS][key] = known
             changed = True
         if known[1] is not None:
@@ -108,10 +110,13 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
 
 
 def _pairs(solids: list[Solid], balls: tuple[Ball, ...]) -> list[tuple[Solid, Solid | Ball]]:
-    """Pairs that may intersect, by their bounding boxes; at least one is a mesh."""
+    """Pairs that may intersect, by their bounding boxes; at least one is a mesh. A mesh of several surfaces pairs with
+    itself.
+    """
     items = [*solids, *balls]
     boxes = [box_of(item.mesh if isinstance(item, Solid) else item.shape) for item in items]
-    return [(items[i], items[j]) for i, j in crossing(boxes) if i < len(solids)]
+    pairs = [(items[i], items[j]) for i, j in crossing(boxes) if i < len(solids)]
+    return pairs + [(solid, solid) for solid in solids if solid.parts]
 
 
 @dataclass(frozen=True)
@@ -142,17 +147,35 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         n_b = middle / np.linalg.norm(middle, axis=1, keepdims=True)
         sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
         return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
+    mesh_b = _triangles(b)
     try:
-        mesh_b = _triangles(b)
         found = cut.mesh_mesh(mesh_a, mesh_b)
     except cut.TooManyPairs:
-        warnings.warn(
-            f"shapes '{a.mesh.id()}' and '{b.mesh.id()}' overlap with too many triangles to look for the curve along "
-            "which they cut into each other: its part of the derivative is missing",
-            UnsupportedWarning,
-            stacklevel=2,
-        )
-        return None
+        return _too_many(f"shapes '{a.mesh.id()}' and '{b.mesh.id()}'")
+    return _between(a, mesh_a, b, mesh_b, found)
+
+
+def _within(solid: Solid) -> tuple | None:
+    """As `_pair`, of the surfaces that one mesh consists of."""
+    mesh = _triangles(solid)
+    try:
+        found = cut_parts(mesh, solid.parts)
+    except cut.TooManyPairs:
+        return _too_many(f"parts of shape '{solid.mesh.id()}'")
+    return _between(solid, mesh, solid, mesh, found)
+
+
+def _too_many(which: str) -> None:
+    warnings.warn(
+        f"{which} overlap with too many triangles to look for the curve along which they cut into each other: its part "
+        "of the derivative is missing",
+        UnsupportedWarning,
+        stacklevel=3,
+    )
+
+
+def _between(a: Solid, mesh_a: cut.TriangleMesh, b: Solid, mesh_b: cut.TriangleMesh, found: cut.Segments):
+    """Columns of the junctions along the segments that were `found`; faces that are nearly parallel are left out."""
     sheet_a = _sheet(a, mesh_a, found.face_a, found.start, found.end)
     sheet_b = _sheet(b, mesh_b, found.face_b, found.start, found.end)
     steep = np.linalg.norm(np.cross(sheet_a["n"], sheet_b["n"]), axis=1) > cut.PARALLEL

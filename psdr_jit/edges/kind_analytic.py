@@ -18,6 +18,7 @@ from .curves import (
     curve_point,
     curve_scale,
     local_viewpoint,
+    own_surface,
     transform_point,
     transform_vector,
 )
@@ -25,7 +26,7 @@ from .film_cover import LEAST_LENGTH, LENS_CENTRE, lens_reach, overlaps_film
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import CURVE_LEAD, VISIBILITY_EPSILON, clearance
+from .points import INSET, VISIBILITY_EPSILON, clearance
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class AnalyticCurves(ContourKind):
         rows, columns = self._columns(row, active)
         point = curve_point(rows.kind, rows.start + t / PIECES, local_viewpoint(columns, view))
         x, scale = transform_point(columns, point.x), curve_scale(columns, point)
-        offset, _ = clearance(x, scale, self.centre)
+        offset, lead = clearance(x, scale, self.centre)
         return OnEdge(
             x=x,
             dx=transform_vector(columns, point.dx_ds) / PIECES,
@@ -89,7 +90,7 @@ class AnalyticCurves(ContourKind):
             local=point.x,
             scale=scale,
             offset=offset,
-            lead=CURVE_LEAD * scale,
+            lead=lead,
             aside=offset,
             valid=active & point.valid,
         )
@@ -99,7 +100,25 @@ class AnalyticCurves(ContourKind):
         return sight.at.x + VISIBILITY_EPSILON * sight.at.scale * sight.n_perp
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
-        return Side.found_by(sight.beside(which), own=which == 0)
+        """The shape itself on the side −n_perp, and whatever a ray meets on the other.
+
+        The shape is never shot at: a ray that passes an outline on its inner side touches the surface, and unless it
+        starts well outside of the bulge it meets the far wall instead.
+        """
+        own = which == 0
+        rows, columns = self._columns(row, active)
+        at = sight.at
+        ω = local_viewpoint(columns, mi.Vector4f(sight.ω.x, sight.ω.y, sight.ω.z, 0))
+        turn = dr.sqrt(2 * sight.offset / at.scale)  # where a ray that passes at the offset would meet it
+        local = own_surface(rows.kind, at.local, mi.Vector3f(ω.x, ω.y, ω.z), turn, mi.Float(INSET))
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = own & active
+        pi.t = dr.select(pi.valid, sight.r, dr.inf)
+        pi.shape = dr.gather(mi.ShapePtr, self.curves.pointers, rows.shape, pi.valid)
+        pi.prim_uv = mi.Point2f(local.x, local.y)  # of a disk; the others ask for the point alone
+        beside = sight.beside(which)
+        ray = mi.Ray3f(dr.select(own, transform_point(columns, local) - sight.r * sight.ω, beside.o), beside.d)
+        return Side(ray, pi, ~own, own, mi.Bool(True))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""

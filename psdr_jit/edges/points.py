@@ -19,10 +19,6 @@ LEAD = 100.0
 #: The same for what rounding adds: far from the origin, a hundredfold is no small distance.
 ROUNDING_LEAD = 10.0
 
-#: The same for curved surfaces, as a fraction of the curve's own scale: a ray just inside a tangent point must start
-#: outside the bulge of the surface, which is sqrt(2 · SIDE_OFFSET) deep.
-CURVE_LEAD = 0.02
-
 #: Share of the way from the edge to its face's centroid at which the face's own radiance is taken. On the edge itself
 #: rounding may put the point inside a surface on which the edge rests, and everything it sees would be occluded.
 INSET = 3e-4

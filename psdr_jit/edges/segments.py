@@ -20,6 +20,7 @@ from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .junctions import Ball, JunctionTable, Solid, find_junctions
+from .parts import Part, parts_of
 from .rows import EdgeRows, concatenate
 from .shells import edge_shells
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
@@ -37,12 +38,14 @@ MAX_COMPARED_EDGES = 20000
 
 @dataclass
 class MeshTopology:
-    """Cached per mesh: valid while the faces stay the same and welded vertices stay together."""
+    """Cached per mesh: valid while faces stay the same, welded vertices together, and outer sides outside."""
 
     faces: mi.UInt32  # kept alive, so that its index identifies it
     host: EdgeTopology
     device: EdgeTopologyDevice
     shell: mi.Float  # per edge, see EdgeRows
+    facing: mi.Float  # per face, the shell of its surface
+    parts: tuple[Part, ...]  # connected surfaces, if there are several
 
 
 #: By name of a mesh and its numbers of vertices and faces.
@@ -85,7 +88,7 @@ def edge_set(
         if seams is not None and seams[i] is not None:
             jumps |= _on_sides(seams[i], topology.device)
         parts.append(_rows(mesh, (positions, faces), topology, jumps, i, first_vertex, moving[i]))
-        solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell))
+        solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell, topology.parts))
         first_vertex += dr.width(positions)
     rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
     junctions = find_junctions(solids, balls, memory)
@@ -116,8 +119,14 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Me
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
     warn_about_mesh(mesh.id(), topology)
-    shell = uploaded(mi.Float, edge_shells(topology, p, f))
-    known = MeshTopology(buffer, topology, upload_topology(topology), shell)
+    shell = edge_shells(topology, p, f)
+    facing = np.zeros(len(f), np.float32)
+    facing[topology.f0] = shell
+    facing[topology.f1[~topology.border]] = shell[~topology.border]
+    known = MeshTopology(
+        buffer, topology, upload_topology(topology), *(uploaded(mi.Float, column) for column in (shell, facing)),
+        parts_of(topology, f),
+    )  # fmt: skip
     memory[TOPOLOGIES][key] = known
     _still_holds(known, buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
     return known
@@ -142,7 +151,15 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
 
 
 def _still_holds(known: MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
-    return same_faces(known.faces, buffer) and _welds_hold(known.device, positions, faces)
+    if not same_faces(known.faces, buffer):
+        return False
+    return bool((_welds_hold(known.device, positions, faces) & _still_outward(known.facing, positions, faces))[0])
+
+
+def _still_outward(facing: mi.Float, positions: mi.Point3f, faces: mi.Vector3u) -> mi.Bool:
+    """Are the closed surfaces, taken together, still turned as `facing` says? A mesh mirrored in place is not."""
+    a, b, c = (dr.gather(mi.Point3f, positions, corner) - dr.gather(mi.Point3f, positions, 0) for corner in faces)
+    return dr.sum(facing * dr.dot(a, dr.cross(b, c))) >= 0
 
 
 def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:
@@ -150,13 +167,13 @@ def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi
     return dr.select(corner == 0, tri.x, dr.select(corner == 1, tri.y, tri.z))
 
 
-def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vector3u) -> mi.Bool:
     """Do vertices that were welded still coincide? An optimiser may have pulled split vertices apart."""
     other = dr.gather(mi.Point3f, positions, _corner_vertex(faces, device.f1, device.corner1.x))
     own = dr.gather(mi.Point3f, positions, device.v0)
     gap = dr.max(dr.select(device.border, 0, dr.norm(other - own)))
     extent = dr.max(dr.max(positions, axis=1) - dr.min(positions, axis=1), axis=None)
-    return bool((gap <= 8 * WELD_TOLERANCE * extent)[0])
+    return gap <= 8 * WELD_TOLERANCE * extent
 
 
 def is_smooth(mesh: mi.Mesh) -> bool:

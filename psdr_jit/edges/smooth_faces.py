@@ -53,15 +53,12 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
             continue
         faces, topology = mesh_faces(mesh), known_topology(mesh, memory)
         n = dr.width(faces)
-        shell = dr.zeros(mi.Float, n)
-        dr.scatter(shell, topology.shell, topology.device.f0)
-        dr.scatter(shell, topology.shell, topology.device.f1)
         parts.append(
             FaceRows(
                 corner=faces + first,
                 shape=dr.full(mi.UInt32, len(chosen), n),
                 prim=dr.arange(mi.UInt32, n),
-                shell=shell * dr.gather(mi.Float, outside, i),
+                shell=topology.facing * dr.gather(mi.Float, outside, i),
                 moves=dr.full(mi.Bool, moving[i], n),
             )
         )

@@ -15,6 +15,7 @@ from psdr_jit.edges.curves import (
     curve_point,
     curve_set,
     local_viewpoint,
+    own_surface,
     transform_point,
 )
 
@@ -108,3 +109,23 @@ def test_world_points_lie_on_the_shape(variant, plugin):
     si = mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(ray)
     reached = np.array(dr.norm(si.p - x)) < 0.1
     assert reached.mean() > (0.95 if plugin != "cylinder" else 0.4), reached.mean()  # the far rim is hidden
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("curve", list(Curve), ids=lambda c: c.name)
+def test_the_own_surface_begins_at_the_curve(variant, curve, view):
+    """Just beside every point of a curve lies the surface, and that of a silhouette turns to the viewer."""
+    turn, inset = 1e-2, 1e-3
+    x, _, outward, _ = evaluate(curve, VIEWS[view])
+    c = np.array(VIEWS[view])
+    ω = x * c[3] - c[:3]
+    ω = ω / np.linalg.norm(ω, axis=1, keepdims=True)
+    kind = dr.full(mi.UInt32, int(curve), N)
+    own = np.array(own_surface(kind, mi.Point3f(x.T), mi.Vector3f(ω.T), mi.Float(turn), mi.Float(inset))).T
+    assert np.abs(np.linalg.norm(own - x, axis=1) - (inset if curve in RIMS else turn)).max() < 1e-4
+    radius = np.linalg.norm(own if curve == Curve.SPHERE_SILHOUETTE else own[:, :2], axis=1)
+    assert np.allclose(radius, 1 - inset if curve == Curve.DISK_RIM else 1, atol=1e-5)
+    assert np.all(np.sum(outward * (own - x), axis=1) < 0)
+    if curve not in RIMS:
+        n = own if curve == Curve.SPHERE_SILHOUETTE else own * np.array([1, 1, 0])
+        assert np.all(np.sum(n * ω, axis=1) < 0)

@@ -1,0 +1,87 @@
+"""Meshes as files have them: several bodies in one mesh, pushed into each other; and mirrored between two calls."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from helpers import TERMS, fd, forward
+
+from benchmarks import meshes
+from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.integrator_specs import build
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.statistics import gain
+
+STEP = 0.006  # of finite differences [scene units]: 0.03 px
+SEEDS, SPP = 16, 512
+TOLERANCE = 0.01
+SPEC = {"type": "psdr_path", "max_depth": 2}
+MOVED = ("shape.vertex_positions", (1, 0, 0.3))
+
+
+def leaning(*turns: tuple[float, tuple[float, float, float]]) -> np.ndarray:
+    """Rotation (3, 3) by angles [degrees] about axes, the last one first."""
+    pose = mi.ScalarTransform4f()
+    for angle, axis in turns:
+        pose = pose.rotate(axis, angle)
+    return np.array(pose.matrix)[:3, :3]
+
+
+def boxes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """A block, and a beam askew through it, as parts of one mesh: the first `count` of them."""
+    points, faces = meshes.box(1)
+    points = (points - meshes.CENTRE) / meshes.RADIUS
+    block, beam = points * (0.6, 0.5, 0.4), points * (0.25, 0.2, 1.0) @ leaning((20, (0, 1, 0))).T + (0.1, -0.1, 0)
+    all_of_it = np.concatenate([block, beam][:count]) @ leaning((25, (0, 0, 1)), (15, (1, 0, 0))).T
+    return all_of_it, np.concatenate([faces + k * len(points) for k in range(count)])
+
+
+def scene_of(points: np.ndarray, faces: np.ndarray) -> mi.Scene:
+    """The mesh above a floor, under a lamp."""
+    grey = {"type": "diffuse", "reflectance": 0.7}
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": grey})
+    mesh = mi.Mesh("shape", len(points), len(faces), props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = points.ravel().astype(np.float32)
+    params["faces"] = faces.ravel().astype(np.uint32)
+    params.update()
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    view = T().look_at(origin=[1.1, -5, 2.1], target=[0, 0, 0], up=[0, 0, 1])
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0.3, -1.2]).scale(3), "bsdf": grey}
+    lamp = {"type": "point", "position": [1, -3, 4.5], "intensity": 60.0}
+    parts = {"shape": mesh, "floor": floor, "lamp": lamp}
+    return mi.load_dict({"type": "scene", "camera": {"type": "perspective", "fov": 26, "to_world": view, "film": film},
+                         **parts}, optimize=False)  # fmt: skip
+
+
+def test_bodies_of_one_mesh_that_cut_into_each_other(llvm):
+    """The curve where they meet is an edge, though no face ends there."""
+    motion = perturb(scene_of(*boxes(2)), *MOVED)
+    reference = fd(motion, SPEC, STEP, SEEDS, 4 * SPP)
+    slope = gain(forward(motion, SPEC, SEEDS, SPP), reference[0::2], reference[1::2])
+    assert slope.stderr < 0.01, slope
+    assert abs(slope.value - 1) < max(TOLERANCE, 3 * slope.stderr), slope
+
+
+def test_a_mesh_that_is_mirrored_between_two_calls(llvm):
+    """Which side of it is outside is found anew: an integrator that knew it before gives what a fresh one does."""
+    points, faces = boxes(1)
+    fixed = {**SPEC, **dict.fromkeys(TERMS.values(), SPP)}  # budgets that follow the noise remember earlier calls
+    scene, used = scene_of(points, faces), build(fixed)
+
+    def derivative(integrator) -> np.ndarray:
+        motion = perturb(scene, *MOVED)
+        sampler = DerivativeSampler(motion, integrator, 0, SPP, groups=1)
+        sampler.add(1)
+        motion.restore()
+        return sampler.images.mean()
+
+    derivative(used)
+    params = mi.traverse(scene)
+    params["shape.vertex_positions"] = (points * [-1, 1, 1]).ravel().astype(np.float32)
+    params.update()
+    fresh = derivative(build(fixed))
+    assert np.abs(fresh).max() > 0.1
+    assert np.allclose(derivative(used), fresh, rtol=1e-4, atol=1e-4 * np.abs(fresh).max())
