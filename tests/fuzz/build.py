@@ -38,6 +38,9 @@ def _pose(steps: list) -> mi.ScalarTransform4f:
             origin, target, up = numbers
             pose = pose.look_at(origin=origin, target=target, up=up)
         else:
+            if name == "rotate":  # Mitsuba takes the axis as it is: one that is not of length 1 shears
+                axis = np.array(numbers[0], dtype=float)
+                numbers[0] = (axis / np.linalg.norm(axis)).tolist()
             pose = getattr(pose, name)(*numbers)
     return pose
 

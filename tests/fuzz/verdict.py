@@ -22,7 +22,7 @@ from psdr_jit.derivative.finite_differences import CentralDifference
 from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import Gain, block_means, block_test, gain
-from psdr_jit.errors import UnsupportedError, UnsupportedWarning
+from psdr_jit.errors import PsdrError, UnsupportedWarning
 
 RIGHT, WRONG, KINK, NOISY, WARNED, REFUSED = (
     "right", "wrong", "no definite derivative", "too noisy", "warned", "refused",
@@ -105,7 +105,7 @@ def _examine(case: Mapping[str, Any], first: Effort, second: Effort) -> tuple[st
         warnings.simplefilter("always", UnsupportedWarning)
         try:
             look = compare(motion, case, first)
-        except UnsupportedError as error:
+        except PsdrError as error:
             return REFUSED, str(error)
     missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
     if missing:
