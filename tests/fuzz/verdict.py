@@ -159,7 +159,7 @@ def _differences(motion: Perturbation, case: Mapping[str, Any], effort: Effort, 
 def asymmetry(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> float:
     """What is left of the difference between the derivatives to either side, where the step is `FINER` times smaller.
 
-    That of a twice differentiable image shrinks with the step, that of a kink stays.
+    That of a twice differentiable image shrinks with the step, that of a kink stays; 0 where noise hides it.
     """
     norms = []
     for finer in (1.0, FINER):
@@ -171,9 +171,10 @@ def asymmetry(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> 
             one_sided.append(_differences(shifted, case, effort, 2 * finer))
             one_sided[-1].add(4 * effort.seeds)
         # independent halves: their product has no bias by noise
-        half = [a.group_means().mean(0) - b.group_means().mean(0) for a, b in
-                zip(one_sided[0].halves, one_sided[1].halves, strict=True)]  # fmt: skip
-        norms.append(np.sqrt(max(float(np.sum(half[0] * half[1])), 0.0)))
+        halves = [a.group_means() - b.group_means() for a, b in
+                  zip(one_sided[0].halves, one_sided[1].halves, strict=True)]  # fmt: skip
+        squared = gain(halves[0], *halves)
+        norms.append(np.sqrt(squared.power) if squared.has_signal else 0.0)
     return norms[1] / norms[0] if norms[0] > 0 else 0.0
 
 
