@@ -72,7 +72,7 @@ def assert_gain(shape: mi.Mesh, param: str, **how):
     """The derivative's gain against finite differences is 1 up to `TOLERANCE` and its error."""
     motion = perturb(scene_of(shape), param, **how)
     spec = {"type": "psdr_path", "max_depth": 1 if shape.is_emitter() else 2}
-    reference = fd(motion, spec, STEP if "direction" in how else TURN, 64, 1024)
+    reference = fd(motion, spec, STEP if "direction" in how else TURN, 64, 512)
     slope = gain(forward(motion, spec, SEEDS, 512), reference[0::2], reference[1::2])
     assert slope.stderr < MAX_STDERR, slope
     assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope

@@ -390,7 +390,7 @@ def test_arguments_of_gradient_and_check(arguments, error):
                                        {"reference_spp": 0}, {"tolerance": "x"}])  # fmt: skip
 def test_arguments_of_check_alone(arguments):
     with pytest.raises(OptionError):
-        psdr_jit.check_gradient(load(), BOX, (1, 0, 0), **{"max_seconds": 1, "spp": 2, **arguments})
+        psdr_jit.check_gradient(load(), BOX, (1, 0, 0), **{"max_seconds": 1, "spp": 2, "reference_spp": 4, **arguments})
 
 
 def test_scene_without_integrator_uses_ours():

@@ -19,6 +19,8 @@ from psdr_jit.scene import io as scene_io
 
 SIZE = {"res": 16}
 BOX = Problem("lit_box", "box.vertex_positions", 0.0, direction=(1, 0, 0))
+CAMERA = Problem("lit_box", "camera.to_world", 0.0, direction=(1, 0, 0))
+PLATE = named("rectangle_moved", "plate.to_world")
 
 ORDERS = {
     "variant, then import": "mi.set_variant('llvm_ad_rgb'); import psdr_jit",
@@ -42,10 +44,10 @@ def test_registration(order):
 def test_variants_switch_back_and_forth(llvm):
     for name in ("llvm_ad_spectral", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
         activate(name)
-        scene = load(BOX, **SIZE)
-        integrator = mi.load_dict({"type": "psdr_path", "max_depth": 2})
+        scene = load(PLATE, **SIZE)
+        integrator = integrator_specs.build(spec_of(scene))
         assert isinstance(integrator, mi.Integrator)  # of this variant, not of the one before
-        image = derivative(scene, integrator)
+        image = derivative(scene, integrator, problem=PLATE)
         assert image.shape[:2] == (16, 16) and np.abs(image).max() > 0
 
 
@@ -144,7 +146,7 @@ def test_primal_is_path(variant):
 @pytest.mark.parametrize("case", ["mesh", "camera"])
 def test_render_and_backward(variant, case):
     """`mi.render` with gradients: forward and backward agree, and with the plugin's own images."""
-    problem = BOX if case == "mesh" else named("camera_perspective", "camera.to_world")
+    problem = BOX if case == "mesh" else CAMERA
     scene = load(problem, **SIZE)
     integrator = integrator_specs.build(spec_of(scene))
     params = mi.traverse(scene)
@@ -182,12 +184,11 @@ def test_other_colours(name):
     reference = {}
     for v in ("llvm_ad_rgb", name):
         activate(v)
-        scene = load(named("rectangle_moved", "plate.to_world"), **SIZE)
+        scene = load(PLATE, **SIZE)
         integrator = integrator_specs.build(spec_of(scene))
         wJv, JTwv, w, Jv = adjoint_identity(scene, "plate.to_world", integrator)
         assert abs(wJv - JTwv) < 1e-5 * w * Jv
-        problem = named("rectangle_moved", "plate.to_world")
-        reference[v] = derivative(scene, integrator, spp=128, problem=problem).mean(-1)
+        reference[v] = derivative(scene, integrator, spp=128, problem=PLATE).mean(-1)
     rgb, image = reference.values()
     assert 0.9 < np.sum(rgb * image) / np.sum(rgb**2) < 1.1
 

@@ -49,7 +49,7 @@ def scene(llvm) -> mi.Scene:
 
 
 def image(scene: mi.Scene, **options) -> np.ndarray:
-    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": "spatial", **options})
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "form": "spatial", **options})
     motion = perturb(scene, BOX, (1, 0, 0))
     motion.attach()
     found = np.array(integrator.render_forward(scene, motion.params, seed=1, spp=4))

@@ -101,8 +101,8 @@ def test_python_functions_accept_them():
     how = dict(direction=(1, 0, 0), spp=2)
     result = psdr_jit.gradient(scene, "shape[1].vertex_positions", seeds=1, **how)
     assert result.param == "shape[1].vertex_positions" and result.total.any()
-    assert psdr_jit.check_gradient(scene, "shape[2].vertex_positions", max_seconds=0.1, **how).param == (
-        "box.vertex_positions")  # fmt: skip
+    check = psdr_jit.check_gradient(scene, "shape[2].vertex_positions", max_seconds=0.1, reference_spp=4, **how)
+    assert check.param == "box.vertex_positions"
     plan = psdr_jit.make_plan(scene, "shape[2].vertex_positions", spp=1)
     assert plan.running and not dr.grad_enabled(mi.traverse(scene)["box.vertex_positions"])
     variable = psdr_jit.Pose("shape[2].vertex_positions", learning_rate=0.01)

@@ -1,0 +1,120 @@
+"""What becomes of scene files that others have written: each thing that can move is moved a little and checked.
+
+`survey(folder)` gives a row for each scene and parameter: computed, undecided, warned, refused, wrong or not finite.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+import psdr_jit
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.check import FAIL, PASS
+from psdr_jit.errors import PsdrError, UnsupportedWarning
+from psdr_jit.scene import io as scene_io
+from psdr_jit.scene.params import ParamInfo, differentiable_params
+
+COMPUTED, UNDECIDED, WARNED, REFUSED, WRONG, NOT_FINITE = (
+    "computed", "undecided", "warned", "refused", "wrong", "not finite",
+)  # fmt: skip
+
+SIDE = 24  # longer side of the image [px]
+DEPTH = 3  # of paths, at most
+DIRECTION, AXIS = (0.6, 0.3, -0.5), (0.2, 1, 0.3)  # of motions
+TOLERANCE = 0.05  # of the gain: a few seconds of a noisy scene know no better
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    param: str
+    word: str
+    gain: float | None
+    stderr: float | None
+    reason: str
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def survey(folder: Path, seconds: float) -> Iterator[Row]:
+    """Rows of all scene files in `folder` and below; a check may take so many seconds."""
+    for path in sorted(folder.rglob("*.xml")):
+        start = time.perf_counter()
+        try:
+            scene = shrunk(scene_io.load_scene(path))
+        except PsdrError as error:
+            yield Row(path.name, "", REFUSED, None, None, str(error), time.perf_counter() - start)
+            continue
+        for info in movable(scene):
+            yield row_of(scene, path.name, info, seconds)
+
+
+def shrunk(scene: mi.Scene) -> mi.Scene:
+    """With films of `SIDE` pixels, whatever the file says."""
+    params = psdr_jit.traverse(scene)
+    for name in [key for key in params.keys() if key.endswith("film.size")]:
+        size = np.array(params[name], dtype=float)
+        small = [max(8, round(SIDE * s / size.max())) for s in size]
+        film = name.removesuffix("size")
+        params[name], params[f"{film}crop_size"], params[f"{film}crop_offset"] = small, small, [0, 0]
+    params.update()
+    return scene
+
+
+def movable(scene: mi.Scene) -> list[ParamInfo]:
+    """Shapes, lights and the first camera: vertices, poses and positions."""
+    names = (".vertex_positions", ".to_world", ".position")
+    first = psdr_jit.traverse(scene.sensors()[0])
+    cameras = 0
+    found = []
+    for info in differentiable_params(scene):
+        if info.differentiable and info.name.endswith(names):
+            cameras += info.kind == "camera"
+            if info.kind != "camera" or (cameras == 1 and "to_world" in first):
+                found.append(info)
+    return found
+
+
+def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
+    """Move one thing, and compare."""
+    start = time.perf_counter()
+    turned = info.kind == "emitter" and info.name.endswith("to_world")  # the sky and the sun are nowhere
+    how = {"rotate": AXIS} if turned else {"direction": DIRECTION}
+    spec = integrator_specs.integrator_spec(scene, "psdr_path")
+    depth = spec.get("max_depth", -1)
+    spec["max_depth"] = DEPTH if depth < 0 else min(depth, DEPTH)
+    integrator = integrator_specs.build(spec)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            check = psdr_jit.check_gradient(scene, info.name, **how, integrator=integrator, max_seconds=seconds,
+                                            tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
+        except PsdrError as error:
+            return Row(file, info.name, REFUSED, None, None, str(error), time.perf_counter() - start)
+    verdict, missing = check.verdict, [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
+    word, reason = {PASS: COMPUTED, FAIL: WRONG}.get(verdict.verdict, UNDECIDED), verdict.reason
+    if missing:
+        word, reason = WARNED, missing[0]
+    if integrator_specs.rejected(integrator) or not np.isfinite(check.estimate).all():
+        word, reason = NOT_FINITE, f"{integrator_specs.rejected(integrator)} samples were not finite"
+    gain, stderr = (x if np.isfinite(x) else None for x in (verdict.gain, verdict.gain_stderr))
+    return Row(file, info.name, word, gain, stderr, reason, time.perf_counter() - start)
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown, a line for each row."""
+    lines = ["| scene | parameter | result | gain | reason |", "|---|---|---|---|---|"]
+    for r in rows:
+        gain = "" if r.gain is None or r.stderr is None else f"{r.gain:.3f} ± {r.stderr:.3f}"
+        lines.append(f"| {r.scene} | {r.param} | {r.word} | {gain} | {r.reason.splitlines()[0]} |")
+    return "\n".join(lines)

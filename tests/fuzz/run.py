@@ -1,0 +1,26 @@
+"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT`."""
+
+from __future__ import annotations
+
+import sys
+
+import mitsuba as mi
+from fuzz.scenes import case_of
+from fuzz.verdict import VARIANT, examine
+
+import psdr_jit  # noqa: F401  (registers the plugins)
+
+
+def main(first: int, count: int) -> None:
+    for seed in range(first, first + count):
+        case = case_of(seed)
+        outcome = examine(case)
+        spec = case["integrator"]
+        print(f"{seed:5d} {outcome.seconds:6.1f} s  {outcome.word:22s} {case['param']} {case['how']} {spec['form']} "
+              f"{spec['max_depth']}: {outcome.text}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    mi.set_variant(VARIANT)
+    mi.set_log_level(mi.LogLevel.Error)
+    main(*(int(word) for word in sys.argv[1:3]))
