@@ -32,7 +32,7 @@ from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
-from .smooth_faces import smooth_faces
+from .smooth_faces import smooth_faces, warn_about_coarse
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -154,7 +154,11 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         return []
     shapes = [job.scene.shapes()[s.index] for s in meshes]
     faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
-    return [] if faces is None else [ShadingOutlines(faces, centre)]
+    if faces is None:
+        return []
+    if any(not e.delta for e in job.facts.emitters):
+        warn_about_coarse(faces, job.call.memory)
+    return [ShadingOutlines(faces, centre)]
 
 
 def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:

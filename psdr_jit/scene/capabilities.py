@@ -91,7 +91,8 @@ _MOVING = "while geometry, a light's pose or the camera is differentiated; "
 SUPPORT = (
     Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
     Row("smooth-shaded meshes", "yes",
-        "where shading normals turn away is an edge of its own; light from such a mesh onto others: 1 to 5 % off"),
+        "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
+        "faces: warning"),
     Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
     Row("SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "error", "materials as well: load the mesh once per copy"),

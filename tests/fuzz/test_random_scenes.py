@@ -20,9 +20,7 @@ COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
 LOADED = 40  # seeds of the quick test
 KNOWN = {
-    26: "a smooth-shaded cube of eight vertices: the dark fringe before its outline spans whole faces",
     30: "the shadow of a disk in the light of a sphere is wrong; of a rectangle, or by another light, it is right",
-    35: "a smooth-shaded prism, as 26",
 }
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 

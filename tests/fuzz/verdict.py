@@ -31,7 +31,6 @@ RIGHT, WRONG, KINK, NOISY, WARNED, REFUSED = (
 VARIANT = "llvm_ad_mono"  # half the work of RGB, and all that moves is the same
 SURE = 5.0  # standard errors
 TOLERANCE = 0.02  # of the gain, and of the largest block: what finite steps leave
-SMOOTH_TOLERANCE = 0.06  # KNOWN: outlines of smooth-shaded meshes are up to 4 % off
 BLOCK = 4  # [px]
 KNOWN_ENOUGH = 0.1  # standard error of a gain that could still tell half of the derivative from all of it
 GROUPS = 32  # of seeds, from whose scatter errors are measured
@@ -141,10 +140,9 @@ def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer
         sampler = estimate if by_estimate else reference
         sampler.add(sampler.seeds)
     d, halves = estimate.images.group_means(), [half.group_means() for half in reference.halves]
-    tolerance = SMOOTH_TOLERANCE if _has_smooth_mesh(case) else TOLERANCE
     f = np.concatenate(halves)
     size = np.abs(block_means(f.mean(0), BLOCK)).max()
-    floor = np.hypot(reference.floor(BLOCK), tolerance * size / SURE)
+    floor = np.hypot(reference.floor(BLOCK), TOLERANCE * size / SURE)
     z = block_test(d, f, BLOCK, floor).max_z
     blocks = (block_means(d.mean(0), BLOCK), block_means(f.mean(0), BLOCK))
     return Look(gain(d, *halves), z, tolerance, estimate.not_finite == 0, *blocks)
@@ -176,7 +174,3 @@ def asymmetry(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> 
         squared = gain(halves[0], *halves)
         norms.append(np.sqrt(squared.power) if squared.has_signal else 0.0)
     return norms[1] / norms[0] if norms[0] > 0 else 0.0
-
-
-def _has_smooth_mesh(case: Mapping[str, Any]) -> bool:
-    return any(isinstance(item, dict) and item.get("smooth") for item in case["scene"].values())

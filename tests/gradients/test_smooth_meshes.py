@@ -6,12 +6,15 @@ The step from that dark fringe to the lit face moves by itself: it is an edge of
 
 from __future__ import annotations
 
+import warnings
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fd, forward
 
 from benchmarks import meshes
+from psdr_jit import make_plan
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import gain
 
@@ -148,3 +151,18 @@ def test_a_floor_lit_by_a_smooth_light(llvm):
     slope = gain(forward(motion, spec, SEEDS, 1024), reference[0::2], reference[1::2])
     assert slope.stderr < MAX_STDERR, slope
     assert abs(slope.value - 1) < 0.02 + 2 * slope.stderr, slope
+
+
+def test_normals_far_off_their_faces_are_named(llvm):
+    """A cube of eight vertices, shaded as if it were round: where a face's plane cuts a light is no edge."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
+                      [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+    lamp = {"type": "rectangle", "emitter": {"type": "area"}}
+    for mesh, named in ((smooth_mesh(corners, corners, faces, **REFLECTOR), True), (sphere(16, **REFLECTOR), False)):
+        mesh.set_id("shape")
+        scene = mi.load_dict({"type": "scene", "shape": mesh, "lamp": lamp, "camera": {"type": "perspective"}})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            make_plan(scene, "shape.vertex_positions", integrator={"type": "psdr_path", "form": "spatial", "sppc": 1})
+        assert any("35 degrees off" in str(w.message) for w in caught) == named
