@@ -145,7 +145,7 @@ def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer
     floor = np.hypot(reference.floor(BLOCK), TOLERANCE * size / SURE)
     z = block_test(d, f, BLOCK, floor).max_z
     blocks = (block_means(d.mean(0), BLOCK), block_means(f.mean(0), BLOCK))
-    return Look(gain(d, *halves), z, tolerance, estimate.not_finite == 0, *blocks)
+    return Look(gain(d, *halves), z, TOLERANCE, estimate.not_finite == 0, *blocks)
 
 
 def _differences(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer: float) -> CentralDifference:
