@@ -76,6 +76,7 @@ CASES = (
     # materials
     Case("glossy reflection", "glossy_floor", BLOCKER, 3, X),
     Case("textured mover", "textured_emitter", "card.vertex_positions", 2, X),
+    Case("patterned floor", "patterns", "floor.to_world", 2, X),
     Case("material only", "cbox", "white.reflectance.value", 4, load=CONTACT),
 )
 QUICK = ("area shadow", "point shadow", "cbox contact", "material only")

@@ -141,7 +141,7 @@ PROBLEMS = (
     Problem("rough_glass", "ball.bsdf.eta", 0.015, load=DEPTH_3, slow=True),
     Problem("rough_glass", "lamp.to_world", 0.004, direction=X, load=DEPTH_3, slow=True),
     # steps inside surfaces
-    Problem("patterns", "floor.to_world", 0.004, direction=X),
+    Problem("patterns", "floor.to_world", 0.004, direction=X, slow=True),
     Problem("patterns", "ball.to_world", 0.004, rotate=(1, 1, 0)),
     Problem("patterns", "camera.to_world", 0.0005, rotate=Y, slow=True),
     # shapes that cut into each other

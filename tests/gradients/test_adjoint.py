@@ -47,7 +47,7 @@ def check(case: str, term: str | None, known: bool | None, **options) -> None:
         assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
 
 
-SLOW = ("orthographic",)  # as "camera-pose", with kernels of its own to compile
+SLOW = ("orthographic", "sunk-ball")  # as "camera-pose" and "floor-around-ball", with kernels of their own to compile
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

@@ -80,7 +80,7 @@ def assert_alike(scene: mi.Scene, nearby: mi.Scene):
 @pytest.mark.parametrize(
     "axis, angle, precision",
     [
-        ((0, 1, 0), 90, QUICK),
+        pytest.param((0, 1, 0), 90, QUICK, marks=pytest.mark.slow),
         pytest.param((0, 1, 0), 90, {}, marks=pytest.mark.slow),
         pytest.param((0, 1, 0), 180, {}, marks=pytest.mark.slow),
         pytest.param((1, 0, 0), 90, {}, marks=pytest.mark.slow),

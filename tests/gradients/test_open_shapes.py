@@ -127,6 +127,7 @@ def assert_agrees(name: str, kind: str, depth: int, param: str, step: float, spp
 LIGHTS = [("point", 2), ("area", 2), ("area", 4), ("sky", 2), ("sky", 3)]
 
 
+@pytest.mark.slow
 def test_a_tube_under_a_turning_camera(llvm):
     assert_agrees("cylinder", "area", 2, "camera.to_world", PAN, rotate=(0, 0.2, 1))
 

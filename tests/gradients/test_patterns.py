@@ -123,7 +123,7 @@ MAPS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(m, marks=() if m == "folded" else slow) for m in MAPS])
+@pytest.mark.parametrize("name", [pytest.param(m, marks=slow) for m in MAPS])
 def test_a_mesh(llvm, name):
     mesh = sheet(texels(3, 5, "mirror"), MAPS[name], 2 if name in ("folded", "none") else 3)
     assert_gain(scene_of(mesh), "thing.vertex_positions", TURNED)
@@ -135,6 +135,7 @@ def test_lines_along_edges_of_a_mesh(llvm):
     assert_gain(scene_of(sheet(checkerboard(8), MAPS["as-it-is"], 4)), "thing.vertex_positions", MOVED)
 
 
+@slow
 def test_faces_of_their_own_colours(llvm):
     mesh = sheet({"type": "mesh_attribute", "name": "face_color"}, None, 3, colours=True)
     assert_gain(scene_of(mesh), "thing.vertex_positions", MOVED)
@@ -154,7 +155,7 @@ def bumpy(plugin: str, depth: float, size: float) -> dict:
 
 
 @pytest.mark.parametrize("thing, param, how", [
-    pytest.param(("rectangle", 0.05, 2.5), "thing.to_world", MOVED, id="moved"),
+    pytest.param(("rectangle", 0.05, 2.5), "thing.to_world", MOVED, marks=slow, id="moved"),
     pytest.param(("rectangle", 0.05, 2.5), "camera.to_world", {"rotate": (0, 0, 1)}, marks=slow, id="camera-turned"),
     pytest.param(("sphere", 0.1, 1), "thing.to_world", MOVED, marks=slow, id="sphere"),
 ])  # fmt: skip

@@ -91,9 +91,8 @@ EVERY_WAY = [
 ]
 
 
-@pytest.mark.parametrize(
-    "segments", [24, pytest.param(64, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("segments", [24, 64, 200])
 @pytest.mark.parametrize("param, how", EVERY_WAY)
 def test_a_glowing_sphere(llvm, segments, param, how):
     """An area light shines to the front of the shading normal alone."""

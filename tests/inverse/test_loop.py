@@ -33,6 +33,7 @@ def gradient_of(problem, iteration=0):
     return loss, {n: {k: np.array(dr.grad(v)).ravel() for k, v in found.items()} for n, found in latents.items()}
 
 
+@pytest.mark.slow
 def test_box_and_lamp_are_found(llvm):
     scene = scene_of()
     target = target_of(scene)
