@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_faces
 from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
@@ -31,7 +31,6 @@ COPLANAR_ANGLE = 1e-4
 #: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
 SEAM_TOLERANCE = 1e-4
 
-
 #: Coinciding edges are looked for among all edges up to this many, among borders only beyond (a cost per call).
 MAX_COMPARED_EDGES = 20000
 
@@ -46,6 +45,7 @@ class MeshTopology:
     shell: mi.Float  # per edge, see EdgeRows
     facing: mi.Float  # per face, the shell of its surface
     parts: tuple[Part, ...]  # connected surfaces, if there are several
+    place: mi.Float | None = None  # the vertices for which it was last found to hold, kept alive likewise
 
 
 #: By name of a mesh and its numbers of vertices and faces.
@@ -111,10 +111,9 @@ def known_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
 
 
 def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> MeshTopology:
-    buffer = faces_buffer(mesh)
     key = (mesh.id(), dr.width(positions), dr.width(faces))
     known = memory[TOPOLOGIES].get(key)
-    if known is not None and _still_holds(known, buffer, positions, faces):
+    if known is not None and _still_holds(known, mesh, positions, faces):
         return known
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
@@ -123,12 +122,10 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Me
     facing = np.zeros(len(f), np.float32)
     facing[topology.f0] = shell
     facing[topology.f1[~topology.border]] = shell[~topology.border]
-    known = MeshTopology(
-        buffer, topology, upload_topology(topology), *(uploaded(mi.Float, column) for column in (shell, facing)),
-        parts_of(topology, f),
-    )  # fmt: skip
+    shells = [uploaded(mi.Float, column) for column in (shell, facing)]
+    known = MeshTopology(faces_buffer(mesh), topology, upload_topology(topology), *shells, parts_of(topology, f))
     memory[TOPOLOGIES][key] = known
-    _still_holds(known, buffer, positions, faces)  # true: its kernels are compiled now, not in the next call
+    _still_holds(known, mesh, positions, faces)  # true: its kernels are compiled now, not in the next call
     return known
 
 
@@ -150,10 +147,14 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
             warnings.warn(message, UnsupportedWarning, stacklevel=2)
 
 
-def _still_holds(known: MeshTopology, buffer: mi.UInt32, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
-    if not same_faces(known.faces, buffer):
+def _still_holds(known: MeshTopology, mesh: mi.Mesh, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+    if not same_faces(known.faces, faces_buffer(mesh)):
         return False
-    return bool((_welds_hold(known.device, positions, faces) & _still_outward(known.facing, positions, faces))[0])
+    place, last = dr.detach(positions_buffer(mesh)), known.place
+    if last is None or last.index != place.index:  # whatever writes to a mesh gives it another buffer
+        holds = _welds_hold(known.device, positions, faces) & _still_outward(known.facing, positions, faces)
+        known.place = place if bool(holds[0]) else None
+    return known.place is not None
 
 
 def _still_outward(facing: mi.Float, positions: mi.Point3f, faces: mi.Vector3u) -> mi.Bool:
