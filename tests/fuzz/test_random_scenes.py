@@ -21,6 +21,7 @@ SHRINK_SECONDS = 180.0
 LOADED = 40  # seeds of the quick test
 KNOWN = {
     30: "the shadow of a disk in the light of a sphere is wrong; of a rectangle, or by another light, it is right",
+    73: "a ball of rough glass that moves over a metallic floor in the light of a sphere, depth 4: gain 0.45",
 }
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
