@@ -63,11 +63,6 @@ def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
     return _parameter(mesh, FACES).array if INDEXED_MESHES else mesh.faces_buffer()
 
 
-def same_faces(a: mi.UInt32, b: mi.UInt32) -> bool:
-    """Do two arrays of corner indices agree? At once if they are one array."""
-    return same_values(a, b)
-
-
 def same_values(a: mi.UInt32 | mi.Float, b: mi.UInt32 | mi.Float) -> bool:
     """Do two flat arrays agree? At once if they are one array."""
     return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_faces
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_values
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box, sensor_frame
 from ..core.varying import varying
@@ -53,7 +53,7 @@ def _is_closed(mesh: mi.Mesh, memory: Memory) -> bool:
     """One closed surface with its normals outward. Remembered while the faces are the same."""
     faces = faces_buffer(mesh)
     known = memory[CLOSED].get(mesh.id())
-    if known is None or not same_faces(known[0], faces):
+    if known is None or not same_values(known[0], faces):
         p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
         topology = build_edge_topology(p, f)
         known = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))

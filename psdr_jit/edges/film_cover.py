@@ -61,6 +61,37 @@ def beside_film(frame: SensorFrame, corners: list[mi.Point3f], border: int) -> m
 
 
 @dataclass
+class PatchOnFilm:
+    """Where three corners are seen from the centre of the lens, by row."""
+
+    lower: mi.Point2f  # of their box on the film [px]
+    upper: mi.Point2f
+    nearest: mi.Float  # their depths [m]
+    farthest: mi.Float
+    reach: mi.Float  # how far other points of the lens see them elsewhere, at most [px]
+
+    @staticmethod
+    def of(corners: list[mi.Point3f], frame: SensorFrame) -> PatchOnFilm:
+        seen = [look_at(frame, x, mi.Point2f(LENS_CENTRE)).p for x in corners]
+        depth = [(frame.to_local @ x).z for x in corners]
+        (lower, upper), (nearest, farthest) = (
+            (f(f(v[0], v[1]), v[2]) for f in (dr.minimum, dr.maximum)) for v in (seen, depth)
+        )
+        reach = dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
+        return PatchOnFilm(mi.Point2f(lower), mi.Point2f(upper), nearest, farthest, reach)
+
+    def cover(self, frame: SensorFrame, border: int, length: mi.Float, margin: mi.Float) -> mi.Float:
+        """`length` [px] of what lies on the patch, 0 where it is off the film by more than `margin` [px] or behind the
+        sensor; the film's diagonal where part of it is too near to be seen as a whole.
+        """
+        film = dr.norm(mi.Vector2f(frame.crop_size))
+        whole = (self.nearest > frame.near) & (self.nearest < frame.far)
+        overlaps = overlaps_film(frame, self.lower, self.upper, margin, border)
+        found = dr.select(whole, dr.select(overlaps, dr.clip(length, LEAST_LENGTH, film), 0), film)
+        return dr.select(self.farthest <= frame.near, 0, found)
+
+
+@dataclass
 class EdgeOnFilm:
     """Which way the faces of an edge turn, by row; conservative for every point of a lens."""
 
@@ -100,15 +131,7 @@ def curve_cover(
     """Relative sampling weight of a curve inside a face [px]: how far its `ends` are apart on the film where they are
     `known`, else the longest side of the face; detached.
     """
-    centre = mi.Point2f(LENS_CENTRE)
-    seen = [look_at(frame, p, centre).p for p in corners]
-    depth = [(frame.to_local @ p).z for p in corners]
-    nearest, farthest = dr.minimum(dr.minimum(*depth[:2]), depth[2]), dr.maximum(dr.maximum(*depth[:2]), depth[2])
-    lower, upper = (f(f(seen[0], seen[1]), seen[2]) for f in (dr.minimum, dr.maximum))
-    reach = dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
-    a, b = (look_at(frame, end, centre).p for end in ends)
-    film = dr.norm(mi.Vector2f(frame.crop_size))
-    length = dr.clip(dr.select(known, dr.norm(b - a), dr.norm(upper - lower)), LEAST_LENGTH, film)
-    overlaps = overlaps_film(frame, mi.Point2f(lower), mi.Point2f(upper), reach, border)
-    in_front = (nearest > frame.near) & (nearest < frame.far)
-    return dr.select(farthest <= frame.near, 0, dr.select(in_front, dr.select(overlaps, length, 0), film))
+    patch = PatchOnFilm.of(corners, frame)
+    a, b = (look_at(frame, end, mi.Point2f(LENS_CENTRE)).p for end in ends)
+    length = dr.select(known, dr.norm(b - a), dr.norm(patch.upper - patch.lower))
+    return patch.cover(frame, border, length, patch.reach)

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
 from .curves import attached_to_world, transform_point, transform_vector
-from .film_cover import LEAST_LENGTH, LENS_CENTRE, beside_film, lens_reach, overlaps_film
+from .film_cover import LENS_CENTRE, PatchOnFilm, beside_film
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
@@ -119,20 +119,13 @@ class PatternLines(FixedKind):
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Lines of the row, times the length on the film of three of them."""
-        rows, lens, film = self.lines.rows, mi.Point2f(LENS_CENTRE), dr.norm(mi.Vector2f(frame.crop_size))
+        rows, lens = self.lines.rows, mi.Point2f(LENS_CENTRE)
         corners = [self._point(rows, q, mi.Bool(True)).x for q in (rows.q0, rows.q1, rows.q2)]
-        views = [look_at(frame, x, lens) for x in corners]
-        depths = [(frame.to_local @ x).z for x in corners]
-        nearest, farthest = (dr.minimum(dr.minimum(*depths[:2]), depths[2]),
-                             dr.maximum(dr.maximum(*depths[:2]), depths[2]))  # fmt: skip
-        whole = (nearest > frame.near) & (nearest < frame.far)
-        low, high = (f(f(views[0].p, views[1].p), views[2].p) for f in (dr.minimum, dr.maximum))
+        patch = PatchOnFilm.of(corners, frame)
         # a curved patch bulges beyond its corners by less than a quarter of its size
-        margin = dr.norm(high - low) / 4 + dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
-        length = dr.clip(self._mean_length(lambda x: look_at(frame, x, lens).p), LEAST_LENGTH, film)
-        length = dr.select(whole, dr.select(overlaps_film(frame, low, high, margin, border), length, 0), film)
-        hidden = (farthest <= frame.near) | self._unseen(frame, corners, border)
-        return dr.select(hidden, 0, mi.Float(rows.count) * length)
+        margin = dr.norm(patch.upper - patch.lower) / 4 + patch.reach
+        length = patch.cover(frame, border, self._mean_length(lambda x: look_at(frame, x, lens).p), margin)
+        return dr.select(self._unseen(frame, corners, border), 0, mi.Float(rows.count) * length)
 
     def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         """By row: certainly beside the film, or turned away, for every point of the lens."""

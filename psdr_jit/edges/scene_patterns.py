@@ -26,7 +26,7 @@ from .kind_pattern import AnalyticPatterns, MeshPatterns
 from .overlaps import apart
 from .pattern_rows import MOST_LINES, PatternSet, pattern_set, too_fine
 from .pattern_shapes import ShapePatterns, analytic_patterns, mesh_patterns, texture_reach
-from .segments import TOPOLOGIES, attached_positions
+from .segments import attached_positions, known_topology
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _seen_sides(
         outside = float(facts.opaque and apart(lower, upper, shape.bbox()))
         one_sided = facts.is_mesh and not facts.smooth and not facts.bsdf_flags & int(mi.BSDFFlags.BackSide)
         fronts.append(patterns.front if one_sided and patterns is not None else 0.0)
-        closed = _face_shells(shape, job.call.memory) if facts.is_mesh else mi.Float(facts.plugin == "sphere")
+        closed = known_topology(shape, job.call.memory).facing if facts.is_mesh else mi.Float(facts.plugin == "sphere")
         shells.append(outside * closed)
         firsts.append(first)
         first += facts.faces if facts.is_mesh else 1
@@ -179,14 +179,3 @@ def _seen_sides(
     side = dr.gather(mi.Float, uploaded(mi.Float, np.array(fronts)), rows.shape)
     front = dr.select((closed < 0) | (side < 0), mi.Float(0), 1)
     return front, dr.select((closed > 0) | (side > 0), mi.Float(0), 1)
-
-
-def _face_shells(mesh: mi.Mesh, memory: Memory) -> mi.Float:
-    """By face: +1 on a closed surface with its normals outward, −1 inward, 0 elsewhere."""
-    shells = dr.zeros(mi.Float, mesh.face_count())
-    known = memory[TOPOLOGIES].get((mesh.id(), mesh.vertex_count(), mesh.face_count()))
-    if known is not None:
-        device = known.device
-        dr.scatter(shells, known.shell * dr.select(device.opposed, 1.0, -1.0), device.f1)
-        dr.scatter(shells, known.shell, device.f0)
-    return shells

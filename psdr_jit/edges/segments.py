@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_faces
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_values
 from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
@@ -148,7 +148,7 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
 
 
 def _still_holds(known: MeshTopology, mesh: mi.Mesh, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
-    if not same_faces(known.faces, faces_buffer(mesh)):
+    if not same_values(known.faces, faces_buffer(mesh)):
         return False
     place, last = dr.detach(positions_buffer(mesh)), known.place
     if last is None or last.index != place.index:  # whatever writes to a mesh gives it another buffer

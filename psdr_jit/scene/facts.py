@@ -204,7 +204,9 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
     shading = tuple(name for name in enabled if _only_shades(name))
-    jumps, glow = jumping_textures(graph, bsdf), jumping_textures(graph, shape.emitter())
+    jumps = jumping_textures(graph, bsdf)
+    steps = jumps + jumping_textures(graph, shape.emitter())
+    missing = missing_patterns(steps)
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
     if plugin in UNSUPPORTED_SHAPES:
         kind = "unsupported"
@@ -231,7 +233,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_weights=delta_weights,
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
-        patterns=tuple(dict.fromkeys(j for j in jumps + glow if j not in missing_patterns(jumps + glow))),
+        patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
         jumps=missing_patterns(jumps),
         sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),

@@ -42,6 +42,14 @@ def pairs_of(found):
     return crossing([box_of(shape) for shape, _ in found])
 
 
+def warnings_about(found) -> int:
+    """How many pairs are named at the first look."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_about_pairs(found, pairs_of(found), Memory())
+    return len(caught)
+
+
 def test_uncovered_pairs_are_named_once(llvm):
     T = mi.ScalarTransform4f
     found = shapes(tube=("cylinder", T()), floor=("rectangle", T().translate([0, 0, 0.5]).scale(3)),
@@ -61,18 +69,13 @@ def test_two_balls(llvm, shift, count):
     T = mi.ScalarTransform4f
     direction = np.ones(3) * shift / np.sqrt(3) * (2.1 / 1.95 if shift == 1.95 else 1)
     found = shapes(a=("sphere", T()), b=("sphere", T().translate(list(direction))))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warn_about_pairs(found, pairs_of(found), Memory())
-    assert len(caught) == count
+    assert warnings_about(found) == count
 
 
 def test_covered_pairs_are_not_named(llvm):
     T = mi.ScalarTransform4f
     found = shapes(ball=("sphere", T()), floor=("rectangle", T().scale(3)), box=("cube", T().translate([0.3, 0, 0])))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_about_pairs(found, pairs_of(found), Memory())
+    assert warnings_about(found) == 0
 
 
 @pytest.mark.parametrize(("height", "count"), [(0.72, 0), (0.6, 1), (-0.5, 1)])
@@ -82,10 +85,7 @@ def test_a_tilted_disk_over_a_ball(llvm, height, count):
     lean = T().translate([height, 0, height]).rotate([0, 1, 0], 45)
     found = shapes(ball=("sphere", T()), disk=("disk", lean))
     assert pairs_of(found) == [(0, 1)]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        warn_about_pairs(found, pairs_of(found), Memory())
-    assert len(caught) == count
+    assert warnings_about(found) == count
 
 
 def test_a_tube_beside_a_corner(llvm):
@@ -93,6 +93,4 @@ def test_a_tube_beside_a_corner(llvm):
     T = mi.ScalarTransform4f
     found = shapes(tube=("cylinder", T().translate([0, 0, 0.2]).scale([0.3, 0.3, 0.5])), box=("cube", T()))
     assert pairs_of(found) == [(0, 1)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_about_pairs(found, pairs_of(found), Memory())
+    assert warnings_about(found) == 0
