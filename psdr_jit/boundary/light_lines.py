@@ -115,6 +115,7 @@ def _from_contour(
     on_surface = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
     elsewhere = active & ~on_surface
     ps, inv_pdf_area = emitter.sample_position(0, u, on_surface)
+    ps.n = _normal_of(ps, emitter, u, on_surface)
     it.p = kind.inside(row, active)
     ds, _ = emitter.sample_direction(it, u, elsewhere)
     infinite = elsewhere & mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
@@ -134,3 +135,16 @@ def _from_contour(
     pmf = dr.select(inv_pmf > 0, dr.rcp(inv_pmf), 0)
     n_perp, across = on.across(ω)
     return LightLine(on, n_perp, across, ω, dist, emitter, value, pdf * pmf, on.valid & (across > 0))
+
+
+def _normal_of(ps: mi.PositionSample3f, emitter: mi.EmitterPtr, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+    """The normal at the point `ps` that `u` gave: Mitsuba 3.9's `sphere` leaves out how it is turned.
+
+    The opposite point of the sphere has the opposite local direction, hence the opposite (u, v): φ + π and −z.
+    """
+    shape = emitter.get_shape()
+    sphere = active & (shape.shape_type() == mi.UInt32(mi.ShapeType.Sphere))
+    opposite = mi.Point2f(dr.select(u.x < 0.5, u.x + 0.5, u.x - 0.5), 1 - u.y)
+    across = ps.p - emitter.sample_position(0, opposite, sphere)[0].p
+    outward = dr.normalize(dr.select(shape.has_flipped_normals(), -across, across))
+    return dr.select(sphere, outward, ps.n)

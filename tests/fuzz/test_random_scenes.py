@@ -19,10 +19,6 @@ FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
 LOADED = 40  # seeds of the quick test
-KNOWN = {
-    30: "the shadow of a disk in the light of a sphere is wrong; of a rectangle, or by another light, it is right",
-    73: "a ball of rough glass that moves over a metallic floor in the light of a sphere, depth 4: gain 0.45",
-}
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
 
@@ -39,8 +35,6 @@ def test_a_random_scene(mono, seed):
     outcome = examine(case)
     if not outcome.failed:
         return
-    if seed in KNOWN:
-        pytest.xfail(KNOWN[seed])
     smallest = shrunk(case, lambda smaller: _same(smaller, outcome), SHRINK_SECONDS)
     pytest.fail(f"seed {seed}: {outcome.word}, {outcome.text}\n{pprint.pformat(smallest, width=120)}")
 

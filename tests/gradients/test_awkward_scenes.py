@@ -207,3 +207,19 @@ def test_shadows_are_seen_through_a_hidden_light(llvm):
     spec = {"type": "psdr_path", "max_depth": 2, "hide_emitters": True}
     reference = fd(motion, spec, 0.02, 16, 1024)
     assert_grad_close(forward(motion, spec, SEEDS, 64), reference, 0.02)
+
+
+def test_a_spherical_light_that_is_turned(llvm):
+    """Casts the shadow of the same light before it was turned: Mitsuba's own normals of sampled points do not turn."""
+
+    def shadow(pose) -> np.ndarray:
+        placed = T().translate([0.4, 2, 0]) @ pose @ T().scale(0.4)
+        lamp = {"type": "sphere", "to_world": placed, "emitter": {"type": "area"}}
+        ball = {"type": "sphere", "to_world": T().translate([0, 0.7, 0]).scale(0.3)}
+        floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": white()}
+        built = scene(camera=camera((0, 2.5, 2.5), (0, 0, 0), 50), lamp=lamp, ball=ball, floor=floor)
+        return forward(perturb(built, "ball.to_world", X), term("sppd", 2), SEEDS, 128)
+
+    straight, turned = shadow(T()), shadow(T().rotate([0.6, 0, 0.8], 140))
+    slope = gain(turned, straight[::2], straight[1::2])
+    assert abs(slope.value - 1) < 4 * slope.stderr and slope.stderr < 0.03
