@@ -248,7 +248,6 @@ CHECKS = (
     check_media,
     check_sensor,
     check_shapes,
-    check_specular,
     check_delta_weights,
     check_extent,
     check_surface_steps,
