@@ -12,7 +12,7 @@ from .film_cover import EdgeOnFilm, straight_cover
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import INSET, clearance, face_sides
+from .points import INSET, VISIBILITY_EPSILON, clearance, face_sides
 from .rows import EdgeRows, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
@@ -115,7 +115,8 @@ class MeshEdges(BetweenFaces):
         return Side(ray, pi, ~face, own, in_view & (rows.border | silhouette | rows.seam) | rows.traced)
 
     def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
-        """Onto the other face where one of two is seen edge-on; the point itself at all other edges.
+        """Onto the other face where one of two is seen edge-on, past both of an outline where one is nearly so; the
+        point itself at all other edges.
 
         A line of sight to such an edge runs along the face, and whether it meets what ends with it is rounding.
         """
@@ -123,7 +124,9 @@ class MeshEdges(BetweenFaces):
         border = dr.gather(mi.Bool, self.rows.border, row, active)
         a0, a1 = face_sides(n0, n1, sight.ω)
         one = ~border & ((a0 == 0) ^ (a1 == 0))
-        return sight.at.x + dr.select(one, dr.sign(a0 + a1) * sight.offset, 0) * sight.n_perp
+        past = ~border & (a0 * a1 > 0) & (dr.minimum(dr.abs(a0), dr.abs(a1)) < VISIBILITY_EPSILON)
+        towards = dr.select(one, 1.0, dr.select(past, -1.0, 0.0))
+        return sight.at.x + towards * dr.sign(a0 + a1) * sight.offset * sight.n_perp
 
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """A point of face 0 or 1 next to the edge, as if the viewer had looked at it."""

@@ -32,7 +32,7 @@ from .film_cover import LENS_CENTRE, curve_cover
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Use, Views
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import clearance
+from .points import VISIBILITY_EPSILON, clearance
 from .shading_curve import Face, curve_on, may_cross
 from .smooth_faces import FaceRows, SmoothFaces
 
@@ -146,6 +146,13 @@ class ShadingOutlines(EdgeKind):
         pi.shape = dr.gather(mi.ShapePtr, self.faces.shapes, rows.shape, active)
         pi.prim_uv = mi.Point2f(sight.at.local.x, sight.at.local.y) + step
         return Side(mi.Ray3f(sight.viewer, sight.ω), pi, mi.Bool(False), own=mi.Bool(False), differs=mi.Bool(True))
+
+    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """Just above a face that is seen all but edge-on: what a line of sight along it meets is rounding."""
+        n = dr.normalize(self._face(row, active)[1].n_g)
+        towards = -dr.dot(n, sight.ω)
+        above = dr.select(dr.abs(towards) < VISIBILITY_EPSILON, dr.sign(towards) * sight.offset, 0)
+        return sight.at.x + above * n
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Material velocity, and −ḣ/|∇h| along m."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from fuzz.build import build
 from helpers import assert_grad_close, fd, forward
 
 from benchmarks import meshes
@@ -98,6 +99,25 @@ def test_a_perspective_camera_in_the_plane_of_a_face(llvm, x, y):
     """The face turns away: the derivative is that of the box a little further, when the face has turned indeed."""
     camera = perspective((x, y, 4), (x / 2, 0, 0))
     assert_alike(scene_of(camera), scene_of(camera, FURTHER * np.sign(x)))
+
+
+@pytest.mark.parametrize("smooth", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_a_face_that_is_barely_seen(llvm, smooth):
+    """A ball one face of which turns to the viewer by 2e-5: lines of sight to its far side are as good as in its plane.
+
+    A random scene, of which all is left out that does not matter.
+    """
+    place, axis = np.array([0.398, 0.144, 0.618]), [-0.411, -0.744, -0.527]
+    images = []
+    for shift in (0.0, 10 * FURTHER):
+        pose = [["translate", list(place + [0, shift, 0])], ["rotate", axis, 49.1], ["scale", 0.505]]
+        ball = {"type": "mesh", "mesh": "ball", "segments": 16, "smooth": smooth, "to_world": pose}
+        view = {"type": "perspective", "fov": 41.4, "film": film() | {"rfilter": {"type": "box"}},
+                "to_world": [["look_at", [-0.871, 1.976, 3.367], [0.195, 0.3, 0], [0, 1, 0]]]}  # fmt: skip
+        scene = build({"type": "scene", "camera": view, "ball": ball | {"emitter": {"type": "area"}}})
+        motion = perturb(scene, "camera.to_world", rotate=(-0.209, 0.603, 0.77))
+        images.append(forward(motion, SPEC, 4, 256).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.02 * np.linalg.norm(images[1])
 
 
 @pytest.mark.slow
