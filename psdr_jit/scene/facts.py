@@ -137,6 +137,10 @@ class SceneFacts:
         return any(emitter.delta for emitter in self.emitters)
 
     @property
+    def has_delta_lobes(self) -> bool:
+        return any(shape.delta_lobes for shape in self.shapes)
+
+    @property
     def has_infinite_emitters(self) -> bool:
         return any(emitter.infinite for emitter in self.emitters)
 
