@@ -208,8 +208,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 
 
 def cost(form: str, sky: bool) -> float:
-    """Time of a line relative to a path of the interior term (mirror and slab at 24², two cores)."""
-    return 2.0
+    """Time of a line relative to a path of the interior term (mirror, cube and ball of glass at 48², two cores)."""
+    return 4.0
 
 
 TERM = Term(

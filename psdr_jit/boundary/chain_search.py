@@ -4,7 +4,8 @@ Every sample is a line across one pixel, horizontal or vertical. A crossing betw
 part (`chain_trace`), and is found by halving. Two crossings may hide each other, so an interval is looked at again:
 where its ends agree, with probability q < 1/2, cut at a random point and with 1/q of its weight; on both sides of a
 crossing always. Every crossing is then found with expected weight 1, however small what it bounds, and the cost is that
-of 1/(1 − 2q) intervals. Only float32 sets a limit: intervals end at the width at which rays can be told apart.
+of 1/(1 − 2q) intervals; a small q is cheap, and noisy at corners. Only float32 sets a limit: intervals end at the width
+at which rays can be told apart.
 
 Crossings of the first segment are not kept, only walked around: they belong to the primary boundary.
 """
@@ -26,8 +27,8 @@ from ..plan.job import Job
 from ..plan.probe_motion import registry_table
 from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Pair, trace_pair
 
-#: Probability with which an interval is cut though its ends agree.
-CUT_SHARE = 0.25
+#: Probability with which an interval is cut though its ends agree: where they see a delta lobe, and elsewhere.
+CUT_SHARE, CUT_SHARE_ELSEWHERE = 0.35, 0.2
 
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
 LEAST_WIDTH, ROUNDING = 2.0**-18, 5e-7
@@ -152,14 +153,16 @@ def _sides(at: Interval, left: mi.Float, right: mi.Float, weight: mi.Float) -> I
     return Interval(at.sample, dr.select(behind, right, at.lo), dr.select(behind, at.hi, left), weight, key)
 
 
-def _cut(lines: Lines, at: Interval, maybe: mi.Bool) -> Interval | None:
+def _cut(lines: Lines, at: Interval, maybe: mi.Bool, specular: mi.Bool) -> Interval | None:
     """Intervals whose ends agree, some of them cut at a random point."""
     wide = at.hi - at.lo > lines.least_width
-    chosen = compact(at, maybe & wide & (_uniform(at.key, 0) < CUT_SHARE))
+    share = dr.select(specular, mi.Float(CUT_SHARE), CUT_SHARE_ELSEWHERE)
+    weighted = Interval(at.sample, at.lo, at.hi, at.weight / share, at.key)
+    chosen = compact(weighted, maybe & wide & (_uniform(at.key, 0) < share))
     if chosen is None:
         return None
     point = dr.lerp(chosen.lo, chosen.hi, _uniform(chosen.key, 1))
-    return _sides(chosen, point, point, chosen.weight / CUT_SHARE)
+    return _sides(chosen, point, point, chosen.weight)
 
 
 def _joined(parts: list) -> Interval | Crossing | None:
@@ -184,10 +187,10 @@ def find_crossings(lines: Lines) -> Crossing | None:
     found = []
     while left is not None:
         pair = lines.compare(left)
-        apart = pair.differs & pair.specular
-        dr.eval(left, apart)
+        apart, specular = pair.differs & pair.specular, mi.Bool(pair.specular)
+        dr.eval(left, apart, specular)
         both = compact(left, apart)
-        nexts = [_cut(lines, left, ~apart)]
+        nexts = [_cut(lines, left, ~apart, specular)]
         if both is not None:
             crossing, behind = _crossings(lines, both)
             found.append(crossing)
@@ -203,7 +206,7 @@ def _crossings(lines: Lines, at: Interval) -> tuple[Crossing | None, list[Interv
     pair = lines.compare(short)
     sure, k = mi.Bool(pair.differs), mi.UInt32(pair.k)
     dr.eval(at, short, sure, k)
-    rest = [_cut(lines, at, ~sure)]
+    rest = [_cut(lines, at, ~sure, mi.Bool(True))]
     chosen = compact(at, sure)
     if chosen is not None:
         crossed = compact(short, sure)
