@@ -14,8 +14,8 @@ is left is −F_θ F_X/(F_x² + F_y²). F_x, F_y and F_θ are derivatives of one
 is attached as well. No virtual camera, no root search, no count of solutions: as the chain begins at the film, all of
 that is settled by tracing it. Steps of the first segment belong to `primary`.
 
-Seen are outlines, creases, and curves along which surfaces cut. Left out are steps within a surface (patterns, and
-where shading normals turn away), and what is seen by more than `chain_trace.CHAIN_DEPTH` segments.
+Seen are outlines, creases, curves along which surfaces cut, and shading outlines. Left out are patterns on surfaces,
+and what is seen by more than `chain_trace.CHAIN_DEPTH` segments.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from ..core.streams import Stream, stream_seed
 from ..options import Options
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
+from ..plan.motion import Motion
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
@@ -120,8 +121,23 @@ def _film_slope(lines: Lines, chain: ChainRecords, pair: Pair, curve: Curve, at:
         first = chain.segment(mi.UInt32(0), mi.Bool(True))
         start = ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d))
         o_grad, d_grad = tangents(start, ray.d)
-    o_grad, d_grad = carry_tangents(chain, pair.k, o_grad, d_grad, mi.Color0f(), AtRest(lines.job.sensor))
-    return dr.dot(curve.c1 + curve.c2, o_grad + curve.t * d_grad)
+    return _slope(lines.job, chain, (pair.k, curve), (o_grad, d_grad), AtRest(lines.job.sensor))
+
+
+def _smooth(job: Job) -> bool:
+    """Is there a shape with interpolated normals?"""
+    return any(s.smooth for s in job.facts.shapes)
+
+
+def _slope(job: Job, chain: ChainRecords, end: tuple, camera: tuple, motion: Motion) -> mi.Float:
+    """Tangent of F at the `end` of chains, (segment, curve), given the tangents `camera` of their first rays."""
+    k, curve = end
+    o_grad, d_grad = carry_tangents(chain, k, *camera, mi.Color0f(), motion)
+    o, d = mi.Point3f(curve.line.o), mi.Vector3f(curve.line.d)
+    with motion.attached(o, d) as moving:
+        dr.set_grad(o, o_grad)
+        dr.set_grad(d, d_grad)
+        return tangents(curve.attached_F(o, d, moving, _smooth(job)))
 
 
 def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -129,11 +145,6 @@ def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.
     first = chain.segment(mi.UInt32(0), mi.Bool(True))
     start = moving.of_camera(steps.film, steps.aperture, first.o)
     return start, moving.of_view(steps.film, steps.aperture, first.d)
-
-
-def _curve_motion(moving, curve: Curve) -> mi.Float:
-    """Σ c_i · m_i, attached, of value 0."""
-    return dr.dot(curve.c1, moving.of_surface(curve.m1)) + dr.dot(curve.c2, moving.of_surface(curve.m2))
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -145,15 +156,11 @@ def forward(job: Job) -> mi.TensorXf:
             if found is None:
                 continue
             steps, chain = found
-            o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-            with job.motion.attached() as moving:
-                if job.facts.camera_moves:
-                    o_grad, d_grad = tangents(*_camera(moving, steps, chain))
-            with job.motion.attached() as moving:
-                curve_grad = tangents(_curve_motion(moving, steps.curve))
-            o_grad, d_grad = carry_tangents(chain, steps.k, o_grad, d_grad, mi.Color0f(), job.motion)
-            c = steps.curve.c1 + steps.curve.c2
-            F_grad = dr.dot(c, o_grad + steps.curve.t * d_grad) - curve_grad
+            camera = mi.Vector3f(0), mi.Vector3f(0)
+            if job.facts.camera_moves:
+                with job.motion.attached() as moving:
+                    camera = tangents(*_camera(moving, steps, chain))
+            F_grad = _slope(part, chain, (steps.k, steps.curve), camera, job.motion)
             image += share * _splat(job, steps, job.call.counters.rejected.keep_finite(steps.value * F_grad))
     return image
 
@@ -173,10 +180,11 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             steps, chain = found
             λ = share * _adjoint(job, steps, grad_in)
             λ = dr.select(dr.isfinite(λ), λ, 0)
-            c = λ * (steps.curve.c1 + steps.curve.c2)
-            with job.motion.attached() as moving:
-                accumulate(-λ * _curve_motion(moving, steps.curve))
-            λ_o, λ_d = carry_adjoints(chain, steps.k, c, steps.curve.t * c, mi.Color0f(), job.motion)
+            o, d = mi.Point3f(steps.curve.line.o), mi.Vector3f(steps.curve.line.d)
+            with job.motion.attached(o, d) as moving:
+                accumulate(λ * steps.curve.attached_F(o, d, moving, _smooth(part)))
+                λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
+            λ_o, λ_d = carry_adjoints(chain, steps.k, λ_o, λ_d, mi.Color0f(), job.motion)
             if job.facts.camera_moves:
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)

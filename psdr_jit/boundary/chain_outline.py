@@ -7,10 +7,12 @@ Along the crossed curve the line of sight x(s) = o + s d satisfies F = 0, to fir
 with m_i one or two material points and t the distance. On an edge, m is a point of it and c ∝ τ × d. On the outline of
 a sphere or cylinder, m is the point of contact and c the normal there: an outline moves with the normal velocity of the
 surface, and a turn of the line of sight about m moves it along the tangent plane. Where two surfaces cut, with normals
-n_i, the curve moves by both: c_1 = (n_2·d) n_1, c_2 = −(n_1·d) n_2.
+n_i, the curve moves by both: c_1 = (n_2·d) n_1, c_2 = −(n_1·d) n_2. And where an interpolated normal n turns away from
+the line of sight, F = n·d itself, at the point that the line meets.
 
 The nearer surface is the one that ends. If both are equally near, they touch along an edge of the one or of the other
-(a crease), or cut into each other: the curve that the line of sight passes closest by is taken.
+(a crease), or cut into each other: the curve that the line of sight passes closest by is taken. A shape that goes on,
+seen from the other side of its shading normal, has a shading outline there.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
 from ..plan.job import Job
+from ..plan.motion import Displacements
 from ..plan.probe_motion import registry_table
 from .chain_trace import Pair
 
@@ -49,6 +52,8 @@ class Outline:
 class Curve:
     """What has been crossed: the c_i and m_i of F. Detached."""
 
+    line: Hit  # the line of sight, and what it meets
+    shading: mi.Bool  # F = n·d
     m1: Hit
     m2: Hit
     c1: mi.Vector3f
@@ -56,6 +61,16 @@ class Curve:
     t: mi.Float
     F: mi.Float  # where the chain was traced [m]
     valid: mi.Bool
+
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, smooth: bool) -> mi.Float:
+        """F of the attached line of sight (o, d) and of what moves. `smooth`: there may be shading outlines."""
+        F = dr.dot(self.c1 + self.c2, o + self.t * d)
+        F -= dr.dot(self.c1, moving.of_surface(self.m1)) + dr.dot(self.c2, moving.of_surface(self.m2))
+        if not smooth:
+            return F
+        si = moving.surface(self.line, mi.Ray3f(o, d), mi.RayFlags.All)
+        n = dr.select(self.shading, mi.Vector3f(si.sh_frame.n), 0)
+        return dr.select(self.shading, dr.dot(n, d), F)
 
 
 @dataclass(frozen=True)
@@ -141,7 +156,7 @@ def _outline(shapes: AnalyticShapes | None, hit: Hit, p: mi.Point3f, line: mi.Ra
 
 
 def _interaction(hit: Hit) -> mi.SurfaceInteraction3f:
-    return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.Minimal)
+    return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.All)
 
 
 def crossed_curve(shapes: AnalyticShapes | None, pair: Pair) -> Curve:
@@ -162,12 +177,18 @@ def crossed_curve(shapes: AnalyticShapes | None, pair: Pair) -> Curve:
     x = line.o + t * line.d
     F_cut = (dr.dot(c1, x - si_near.p) + dr.dot(c2, x - si_far.p)) * scale
     cut = touching & dr.isfinite(scale) & (CUT * dr.abs(F_cut) < dr.abs(best.gap))
+
+    h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
+    shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)
+    F = dr.select(shading, dr.select(first, h_near, h_far), dr.select(cut, F_cut, best.gap))
     return Curve(
+        line=pair.a,
+        shading=shading,
         m1=dr.select(cut, _resting(near, si_near.p, near.prim_uv), best.m),
         m2=dr.select(cut, _resting(far, si_far.p, far.prim_uv), best.m),
         c1=dr.select(cut, mi.Vector3f(c1 * scale), best.n),
         c2=dr.select(cut, mi.Vector3f(c2 * scale), 0),
         t=dr.select(cut, t, dr.dot(best.m.o - line.o, line.d)),
-        F=dr.select(cut, F_cut, best.gap),
-        valid=dr.isfinite(dr.select(cut, F_cut, best.gap)),
+        F=F,
+        valid=dr.isfinite(F),
     )

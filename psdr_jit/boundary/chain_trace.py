@@ -7,8 +7,9 @@ that also scatters smoothly (plastic) ends no chain. Total reflection leaves the
 its value has gone to 0 before, so that a chain may end there without a step.
 
 Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
-shapes are flat, the same shape met from the same side elsewhere, unless one point lies far off the other's tangent
-plane for their distance (a surface in front of itself) or their normals differ (a crease). Such a guess may be wrong
+shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
+unless one point lies far off the other's tangent plane for their distance (a surface in front of itself) or their
+normals differ (a crease). Such a guess may be wrong
 for rays that are far apart, which costs time, and is right for those close by, which is what counts.
 """
 
@@ -122,7 +123,8 @@ def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) ->
     one_plane &= dr.abs(dr.dot(a.n, offset)) < near
     n_a, n_b = a.sh_frame.n, b.sh_frame.n
     off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
-    one_curve = side & (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
+    shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
+    one_curve = side & shaded & (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
     return same & (~both | dr.select(flat, one_plane & side, one_curve))
 
 
