@@ -132,7 +132,7 @@ def _smooth(job: Job) -> bool:
 def _slope(job: Job, chain: ChainRecords, end: tuple, camera: tuple, motion: Motion) -> mi.Float:
     """Tangent of F at the `end` of chains, (segment, curve), given the tangents `camera` of their first rays."""
     k, curve = end
-    o_grad, d_grad = carry_tangents(chain, k, *camera, mi.Color0f(), motion)
+    o_grad, d_grad = carry_tangents(chain, k, *camera, motion)
     o, d = mi.Point3f(curve.line.o), mi.Vector3f(curve.line.d)
     with motion.attached(o, d) as moving:
         dr.set_grad(o, o_grad)
@@ -184,7 +184,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             with job.motion.attached(o, d) as moving:
                 accumulate(λ * steps.curve.attached_F(o, d, moving, _smooth(part)))
                 λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
-            λ_o, λ_d = carry_adjoints(chain, steps.k, λ_o, λ_d, mi.Color0f(), job.motion)
+            λ_o, λ_d = carry_adjoints(chain, steps.k, λ_o, λ_d, job.motion)
             if job.facts.camera_moves:
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)

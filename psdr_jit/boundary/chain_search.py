@@ -166,16 +166,24 @@ def _cut(lines: Lines, at: Interval, maybe: mi.Bool, specular: mi.Bool) -> Inter
 
 
 def _joined(parts: list) -> Interval | Crossing | None:
-    """Several of the same kind as one."""
+    """Several of the same kind as one, evaluated. `dr.concat` would compile a kernel for every number of them."""
     parts = [part for part in parts if part is not None]
     if not parts:
         return None
-    kind = type(parts[0])
-    if len(parts) == 1:
-        return parts[0]
-    if dr.is_array_v(parts[0]):
-        return dr.concat(parts)
-    return kind(**{name: _joined([getattr(p, name) for p in parts]) for name in kind.__dataclass_fields__})
+    dr.eval(parts)
+    joined = parts[0]
+    for part in parts[1:]:
+        size, i = _width(joined), dr.arange(mi.UInt32, _width(joined) + _width(part))
+        behind = varying(mi.UInt32, size)
+        first = i < behind
+        head = dr.gather(type(part), joined, i, first)
+        joined = dr.select(first, head, dr.gather(type(part), part, i - behind, ~first))
+        dr.eval(joined)
+    return joined
+
+
+def _width(part: Interval | Crossing) -> int:
+    return dr.width(part.k if isinstance(part, Crossing) else part.sample)
 
 
 def find_crossings(lines: Lines) -> Crossing | None:

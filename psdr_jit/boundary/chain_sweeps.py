@@ -47,9 +47,7 @@ def _onward(hit: Hit, d_next: mi.Vector3f, ray: mi.Ray3f, moving: Displacements,
 
 
 @dr.syntax
-def carry_tangents(
-    chain: ChainRecords, last: mi.UInt32, o_grad: mi.Vector3f, d_grad: mi.Vector3f, wavelengths, motion: Motion
-):
+def carry_tangents(chain: ChainRecords, last: mi.UInt32, o_grad: mi.Vector3f, d_grad: mi.Vector3f, motion: Motion):
     """Tangents `(ȯ, ḋ)` of the ray of segment `last`, given those of the camera ray. Detached."""
     k = mi.UInt32(0)
     o_grad, d_grad = mi.Vector3f(o_grad), mi.Vector3f(d_grad)
@@ -60,7 +58,7 @@ def carry_tangents(
         with motion.attached(o, d) as moving:
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            x, onward = _onward(hit, d_next, mi.Ray3f(o, d, 0, wavelengths), moving, active)
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
             x_grad, onward_grad = tangents(x, onward)
         o_grad, d_grad = mi.Vector3f(x_grad), mi.Vector3f(onward_grad)
         k += 1
@@ -69,9 +67,7 @@ def carry_tangents(
 
 
 @dr.syntax
-def carry_adjoints(
-    chain: ChainRecords, last: mi.UInt32, λ_o: mi.Vector3f, λ_d: mi.Vector3f, wavelengths, motion: Motion
-):
+def carry_adjoints(chain: ChainRecords, last: mi.UInt32, λ_o: mi.Vector3f, λ_d: mi.Vector3f, motion: Motion):
     """Adjoints `(λ_o, λ_d)` of the camera ray, given those of the ray of segment `last`; θ receives its share."""
     k = mi.UInt32(last)
     λ_o, λ_d = mi.Vector3f(λ_o), mi.Vector3f(λ_d)
@@ -81,7 +77,7 @@ def carry_adjoints(
         hit, d_next = chain.segment(k, active), chain.segment(k + 1, active).d
         o, d = mi.Point3f(hit.o), mi.Vector3f(hit.d)
         with motion.attached(o, d) as moving:
-            x, onward = _onward(hit, d_next, mi.Ray3f(o, d, 0, wavelengths), moving, active)
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
             dr.backward_from(dr.dot(λ_o, x) + dr.dot(λ_d, onward))
             λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
         active = k > 0

@@ -245,19 +245,25 @@ def assert_gain(motion: Perturbation, depth: int, step: float):
     "mirror.to_world",
     pytest.param("camera.to_world", marks=pytest.mark.slow),
     pytest.param("card.to_world", marks=pytest.mark.slow),
+    pytest.param("glass.to_world", marks=pytest.mark.slow),
+    pytest.param("glass.vertex_positions", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_backward_mode_is_the_adjoint(llvm, name):
-    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, **ALONE})
-    scene = mi.load_dict(in_mirror(), optimize=False)
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, **ALONE})
+    if name.startswith("glass"):
+        scene = behind_glass(ball() if name.endswith("to_world") else smooth_ball())
+    else:
+        scene = mi.load_dict(in_mirror(), optimize=False)
     forwards, backwards, w, jv = adjoint_identity(scene, name, integrator, spp=64)
     assert jv > 0
     assert abs(forwards - backwards) < 1e-5 * w * jv
 
 
 def test_it_is_left_out_without_mirrors_and_glass(llvm):
-    plan = make_plan(mi.load_dict(in_mirror(), optimize=False), ["card.to_world"], integrator=BUDGETS)
-    assert plan.term("chain").runs
+    spec = {"type": "psdr_path", **BUDGETS}
     description = in_mirror()
+    plan = make_plan(mi.load_dict(description, optimize=False), ["card.to_world"], integrator=spec)
+    assert plan.term("chain").runs
     description["mirror"]["bsdf"] = {"type": "roughconductor"}
-    plan = make_plan(mi.load_dict(description, optimize=False), ["card.to_world"], integrator=BUDGETS)
+    plan = make_plan(mi.load_dict(description, optimize=False), ["card.to_world"], integrator=spec)
     assert not plan.term("chain").runs and "no surface is a mirror" in plan.term("chain").reason
