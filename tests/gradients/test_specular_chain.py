@@ -238,7 +238,6 @@ def assert_gain(motion: Perturbation, depth: int, step: float):
     slope = gain(forward(motion, spec, 2 * SEEDS, 512), reference[0::2], reference[1::2])
     assert slope.stderr < TOLERANCE, slope
     assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope
-    print(slope)
 
 
 @pytest.mark.parametrize("name", [
