@@ -20,6 +20,10 @@ class Stream(IntEnum):
     INDIRECT_EDGE = 6
     INDIRECT_SUBPATH = 7
     INDIRECT_RADIANCE = 8
+    CHAIN_LINE = 9
+    CHAIN_LOBES = 10
+    CHAIN_CUTS = 11
+    CHAIN_RADIANCE = 12
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:
