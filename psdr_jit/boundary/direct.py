@@ -35,7 +35,7 @@ from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.relevance import SecondaryEdges, line_weights
+from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
 from . import segment_motion
@@ -173,8 +173,7 @@ def longest_subpath(job: Job) -> int:
 
 
 ESTIMATOR = SecondaryTerm(
-    name=NAME,
-    use=Use.SHADOW,
+    edges=lambda job: secondary_edges(job, NAME, Use.SHADOW),
     longest=longest_subpath,
     sample=sample,
     trace=trace,
@@ -209,6 +208,6 @@ TERM = Term(
     forward=lambda job: segment_motion.forward(job, ESTIMATOR),
     backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATOR, grad_in),
     edges=EdgeSampling(
-        lambda job: line_weights(job, ESTIMATOR.use), "no light sees the others as an outline, or they are coplanar"
+        lambda job: line_weights(job, Use.SHADOW), "no light sees the others as an outline, or they are coplanar"
     ),
 )
