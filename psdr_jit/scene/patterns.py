@@ -47,7 +47,12 @@ def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
 
 def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
     """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
-    found, todo = {}, [node for node in (shape.bsdf(), shape.emitter()) if node is not None]
+    return stepping_textures([shape.bsdf(), shape.emitter()])
+
+
+def stepping_textures(owners: list[mi.Object | None]) -> list[mi.Object]:
+    """The textures and bump maps below `owners` that step, each once."""
+    found, todo = {}, [node for node in owners if node is not None]
     while todo:
         node = todo.pop()
         if id(node) not in found and not isinstance(node, mi.Shape):
