@@ -118,15 +118,13 @@ class LightSteps:
 
     def weights(self) -> mi.Float:
         """By row: its length as the light sees it, times the step across it; not 0 where that has only been missed."""
-        everything, far = dr.arange(mi.UInt32, dr.width(self.rows.light)), varying(mi.Float, self.far)
+        lane, far = dr.arange(mi.UInt32, PROBES * dr.width(self.rows.light)), varying(mi.Float, self.far)
         wavelengths = dr.zeros(mi.Interaction3f).wavelengths
         if mi.is_spectral:
             wavelengths = type(wavelengths)(WAVELENGTH)
-        length, step = mi.Float(0), mi.Float(0)
-        for k in range(PROBES):
-            ray = self.ray(everything, mi.Float((k + 0.5) / PROBES))
-            length += ray.across / PROBES
-            step += dr.max(dr.abs(ray.step(far, wavelengths, mi.Bool(True)))) * dr.square(far) / PROBES
+        ray = self.ray(lane // PROBES, (mi.Float(lane % PROBES) + 0.5) / PROBES)
+        parted = dr.max(dr.abs(ray.step(far, wavelengths, mi.Bool(True)))) * dr.square(far)
+        length, step = (dr.block_reduce(dr.ReduceOp.Add, x, PROBES) / PROBES for x in (ray.across, parted))
         mean = dr.mean(step)
         dr.make_opaque(mean)
         return length * dr.select(mean > 0, step + UNPROBED * mean, 1)
