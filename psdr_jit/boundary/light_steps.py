@@ -21,7 +21,9 @@ from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
+from ..core.varying import varying
 from ..edges.location import EdgeLocation
+from ..paths.rays import SHADOW_EPSILON
 from ..plan.job import Job
 from ..sampling.light_steps import SampledSteps, sampled_light_steps
 from ..sampling.rows import edge_samples
@@ -68,18 +70,19 @@ def sample(job: Job, steps: SampledSteps) -> StepLine:
 def trace(job: Job, steps: SampledSteps, line: StepLine) -> StepOnReceiver | None:
     """The first receiver of each; those that meet none, or part nothing there, are left out (value 0)."""
     light = steps.table.ray(line.row, line.t)
-    ray = mi.Ray3f(light.o, light.d, 0, line.wavelengths)
+    # Whatever is this close to a light casts no shadow in `path` either: a lamp may lie in the surface it hangs from.
+    lead = SHADOW_EPSILON * varying(mi.Float, steps.table.far)
+    ray = mi.Ray3f(light.o + lead * light.d, light.d, 0, line.wavelengths)
     pi = job.scene.ray_intersect_preliminary(ray, coherent=False)
-    active = pi.is_valid() & (light.across > 0)
-    step = light.step(pi.t, line.wavelengths, active)
-    x = light.o + pi.t * light.d
+    active, r = pi.is_valid() & (light.across > 0), pi.t + lead
+    step = light.step(r, line.wavelengths, active)
     found = StepOnReceiver(
         lane=line.lane,
-        at=EdgeLocation(line.row, line.t, x, mi.Point3f(0), light.scale * pi.t),
+        at=EdgeLocation(line.row, line.t, light.o + r * light.d, mi.Point3f(0), light.scale * r),
         ω=-light.d,
         n_perp=light.n_perp,
         receiver=Hit.of(ray, pi),
-        value=-step * line.weight * light.across * pi.t,
+        value=-step * line.weight * light.across * r,
         pdf=line.pdf,
         wavelengths=line.wavelengths,
     )

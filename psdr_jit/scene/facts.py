@@ -27,7 +27,7 @@ from .graph import (
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
-from .patterns import missing_patterns
+from .patterns import missing_patterns, steps_of_light
 
 
 @dataclass(frozen=True)
@@ -260,8 +260,7 @@ def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: l
     owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
     name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
     jumps, rim = jumping_textures(graph, emitter), rim_of_cone(graph, emitter)
-    missing = missing_patterns(jumps)
-    steps = _steps_of_light(plugin, rim, tuple(jump for jump in jumps if jump not in missing))
+    steps = steps_of_light(emitter, plugin, rim, jumps)
     moving = POSE_PARAMETERS | (CONE_PARAMETERS if steps else frozenset())
     pose = tuple(name for name in enabled if name in moving)
     return EmitterFacts(
@@ -273,19 +272,10 @@ def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: l
         varies=plugin not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
         rim=rim,
         steps=steps,
-        jumps=missing if steps or (owners and plugin == "area") else jumps,
+        jumps=missing_patterns(jumps) if steps or (owners and plugin == "area") else jumps,
         pose=pose,
         radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
     )
-
-
-def _steps_of_light(plugin: str, rim: str, patterns: tuple[str, ...]) -> tuple[str, ...]:
-    """Those that slide over the surfaces as the light moves against them."""
-    if plugin == "projector":
-        return ("its frame", *patterns)
-    if plugin == "spot":
-        return (*(("the rim of its cone",) if rim == "hard" else ()), *patterns)
-    return ()
 
 
 def _sensor_facts(graph: SceneGraph, sensor: mi.Sensor) -> SensorFacts:

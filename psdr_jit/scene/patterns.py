@@ -45,6 +45,18 @@ def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(jump for jump in jumps if jump.split(" ")[0] not in PATTERN_PLUGINS)
 
 
+def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str, ...]) -> tuple[str, ...]:
+    """Of a projector or a spot: the steps that slide over surfaces as the light moves against them, and are edges.
+
+    `rim`: of `graph.rim_of_cone`; `jumps`: of `graph.jumping_textures`.
+    """
+    own = {"projector": ("its frame",), "spot": ("the rim of its cone",) if rim == "hard" else ()}.get(plugin)
+    if own is None or emitter.sampling_weight() == 0:  # what is never sampled lights nothing
+        return ()
+    missing = missing_patterns(jumps)
+    return (*own, *(jump for jump in jumps if jump not in missing))
+
+
 def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
     """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
     return stepping_textures([shape.bsdf(), shape.emitter()])

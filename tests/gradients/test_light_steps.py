@@ -75,7 +75,7 @@ def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int
 
 
 @pytest.mark.parametrize("light, param, how", [
-    pytest.param(projector, "light.to_world", MOVED, id="frame-moved"),
+    pytest.param(projector, "light.to_world", MOVED, id="frame-moved", marks=slow),
     pytest.param(projector, "light.to_world", TURNED, id="frame-turned", marks=slow),
     pytest.param(projector, "floor.to_world", RAISED, id="frame-floor-raised", marks=slow),
     pytest.param(projector, "camera.to_world", {"rotate": (0, 0, 1)}, id="frame-camera-turned", marks=slow),
@@ -133,6 +133,21 @@ def test_a_rough_conductor(llvm):
 def test_seen_over_a_further_bounce(llvm, param, how, form):
     scene = scene_of(projector(picture()), wall=wall(), **({"card": card()} if param.startswith("card") else {}))
     assert_gain(scene, param, how, max_depth=3, form=form)
+
+
+@slow
+def test_a_lamp_in_the_surface_it_hangs_from(llvm):
+    ceiling = {"type": "rectangle", "bsdf": {"type": "twosided", "of": {"type": "diffuse"}},
+               "to_world": mi.ScalarTransform4f().translate([0, 0, 2.5]).scale(0.5)}  # fmt: skip
+    light = spot(to_world=pose((0.3, -0.3, 2.5), (0, 0, 0)))
+    assert_gain(scene_of(light, ceiling=ceiling), "floor.to_world", RAISED)
+
+
+@slow
+def test_a_stretched_picture_on_a_ball(llvm):
+    ball = {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.4, "bsdf": {"type": "diffuse"}}
+    light = {**projector(), "fov": 15.0, "to_world": pose() @ mi.ScalarTransform4f().scale([1, 1.5, 1])}
+    assert_gain(scene_of(light, ball=ball), "ball.to_world", {"direction": (0.4, 0.3, 0.5)})
 
 
 @slow

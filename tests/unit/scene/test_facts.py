@@ -423,6 +423,7 @@ def test_emitters_with_steps(emitter, moving, warned):
 @pytest.mark.parametrize("light, steps, pose", [
     ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, ("the rim of its cone",), True),
     ({"type": "spot", "cutoff_angle": 20, "beam_width": 15}, (), False),
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 20, "sampling_weight": 0.0}, (), False),  # lights nothing
     ({"type": "spot", "texture": {"type": "checkerboard"}}, ("checkerboard",), True),
     ({"type": "projector", "irradiance": 1.0}, ("its frame",), True),
     ({"type": "projector", "irradiance": {"type": "checkerboard"}}, ("its frame", "checkerboard"), True),
