@@ -12,7 +12,8 @@ edge's material velocity, u_S the emitter point's (the interior term keeps emitt
 the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
-Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both.
+Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
+brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`).
 """
 
 from __future__ import annotations
