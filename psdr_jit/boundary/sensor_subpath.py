@@ -124,6 +124,11 @@ def recorded_vertices(job: Job, limit: int) -> int:
     return min(limit, 1) if only_camera and job.plan.prunes else limit
 
 
+def longest_from_light(job: Job) -> int:
+    """Vertices from the sensor to a receiver of light, at most: one segment is left for the emitter."""
+    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
+
+
 class _Flat:
     """A flat output array that a recorded loop scatters into, hidden from its state."""
 

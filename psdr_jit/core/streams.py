@@ -20,6 +20,8 @@ class Stream(IntEnum):
     INDIRECT_EDGE = 6
     INDIRECT_SUBPATH = 7
     INDIRECT_RADIANCE = 8
+    LIGHT_STEP = 9
+    LIGHT_STEP_SUBPATH = 10
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -106,8 +106,13 @@ def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
 
 def _unchanged(known: _Known, values: list, buffers: list) -> bool:
     """A rectangle that moves gets new buffers of the same content."""
-    same = [_identity(v) for v in known.values] == [_identity(v) for v in values]
+    same = same_parameters(known.values, values)
     return same and all(same_values(a, b) for a, b in zip(known.buffers, buffers, strict=True))
+
+
+def same_parameters(known: list, values: list) -> bool:
+    """Are textures and what was found in them the same objects and arrays? The `known` ones must be alive."""
+    return [_identity(v) for v in known] == [_identity(v) for v in values]
 
 
 def _identity(value: Any) -> Any:

@@ -79,6 +79,9 @@ POSE_PARAMETERS = frozenset({
 })  # fmt: skip
 """Emitter parameters that move the light; all others scale or shape what it emits."""
 
+CONE_PARAMETERS = frozenset({"cutoff_angle", "beam_width"})
+"""Of a spot: they move the steps of its light, if it has any."""
+
 
 class Row(NamedTuple):
     feature: str
@@ -102,8 +105,8 @@ SUPPORT = (
     Row("batch sensor", "yes", "its sensors are rendered one by one; they need films with its filter and pixel format"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes", ""),
-    Row("point, spot, directional light", "yes", "a spot without a soft rim: warning"),
-    Row("projector", "warning", _MOVING + "the frame of its picture is a step that is not sampled"),
+    Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
+    Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask, hair", "error",

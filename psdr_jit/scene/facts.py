@@ -13,21 +13,21 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
+from .capabilities import ANALYTIC_SHAPES, CONE_PARAMETERS, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
 from .graph import (
     SceneGraph,
     blends_delta,
     delta_lobes,
-    is_hard_edged,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
     plugin_name,
+    rim_of_cone,
     sees_frame,
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
-from .patterns import missing_patterns
+from .patterns import missing_patterns, steps_of_light
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,10 @@ class EmitterFacts:
     delta: bool  # a point or a direction: reached by emitter sampling only
     infinite: bool
     varies: bool  # what is seen of it directly differs from point to point or with the direction
-    hard_edge: bool  # a spot whose cone has no soft rim
-    jumps: tuple[str, ...]  # discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
-    pose: tuple[str, ...]  # enabled parameters that move it
+    rim: str  # of a spot's cone, see `graph.rim_of_cone`
+    steps: tuple[str, ...]  # of a projector or spot: steps of its light that are edges, "its frame", "bitmap 'slide'"
+    jumps: tuple[str, ...]  # other discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
+    pose: tuple[str, ...]  # enabled parameters that move it, or its steps
     radiance: tuple[str, ...]  # all other enabled parameters
 
 
@@ -135,6 +136,11 @@ class SceneFacts:
     @property
     def has_delta_emitters(self) -> bool:
         return any(emitter.delta for emitter in self.emitters)
+
+    @property
+    def has_light_steps(self) -> bool:
+        """Some light throws steps of its own on the surfaces: a picture, or a cone with a hard rim."""
+        return any(emitter.steps for emitter in self.emitters)
 
     @property
     def has_infinite_emitters(self) -> bool:
@@ -249,21 +255,24 @@ def _only_shades(parameter: str) -> bool:
 
 
 def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: list) -> EmitterFacts:
-    enabled = graph.enabled_of(emitter)
-    pose = tuple(name for name in enabled if name in POSE_PARAMETERS)
+    enabled, plugin = graph.enabled_of(emitter), plugin_name(emitter)
     flags = emitter.flags()
     owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
     name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
-    jumps = jumping_textures(graph, emitter)
+    jumps, rim = jumping_textures(graph, emitter), rim_of_cone(graph, emitter)
+    steps = steps_of_light(emitter, plugin, rim, jumps)
+    moving = POSE_PARAMETERS | (CONE_PARAMETERS if steps else frozenset())
+    pose = tuple(name for name in enabled if name in moving)
     return EmitterFacts(
         name=name,
-        plugin=plugin_name(emitter),
+        plugin=plugin,
         shape=owners[0] if owners else -1,
         delta=bool(flags & int(mi.EmitterFlags.Delta)),
         infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
-        varies=plugin_name(emitter) not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
-        hard_edge=is_hard_edged(graph, emitter),
-        jumps=missing_patterns(jumps) if owners and plugin_name(emitter) == "area" else jumps,
+        varies=plugin not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
+        rim=rim,
+        steps=steps,
+        jumps=missing_patterns(jumps) if steps or (owners and plugin == "area") else jumps,
         pose=pose,
         radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
     )

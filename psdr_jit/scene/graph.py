@@ -18,8 +18,9 @@ from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMO
 from .names import traverse
 from .params import parameter_value
 
-HARD_EDGE = 1e-3
-"""A spot whose rim is thinner than this fraction of its cone counts as a step: no sampling resolves it."""
+HARD_RIM, THIN_RIM = 1e-6, 1e-3
+"""A spot's rim, relative to its cone: narrower than the first, by rounding alone, it is a step; narrower than the
+second, few samples meet it."""
 
 UNEVEN_SCALE = 1e-4
 """Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
@@ -236,12 +237,16 @@ def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
     return False
 
 
-def is_hard_edged(graph: SceneGraph, emitter: mi.Emitter) -> bool:
-    """Whether a spot light's intensity drops to zero in a step, at the rim of its cone."""
+def rim_of_cone(graph: SceneGraph, emitter: mi.Emitter) -> str:
+    """How a spot light's intensity drops to zero: "soft", "thin" (few samples meet the slope) or "hard" (in a step).
+
+    "" for other lights, and while a function is being frozen.
+    """
     cutoff, beam = (_host(graph.value(emitter, name)) for name in ("cutoff_angle", "beam_width"))
     if cutoff is None or beam is None:
-        return False
-    return bool(np.any(cutoff - beam <= HARD_EDGE * cutoff))
+        return ""
+    width = np.min(cutoff - beam)
+    return "hard" if width <= HARD_RIM * cutoff.max() else "thin" if width <= THIN_RIM * cutoff.max() else "soft"
 
 
 def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:

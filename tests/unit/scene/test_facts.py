@@ -400,12 +400,13 @@ def test_non_finite_vertices():
 @pytest.mark.parametrize(
     ("emitter", "moving", "warned"),
     [
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "floor.to_world", True),
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "light.cutoff_angle", True),
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "light.intensity.value", False),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "floor.to_world", False),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "floor.to_world", True),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "light.cutoff_angle", True),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "light.intensity.value", False),
         ({"type": "spot", "cutoff_angle": 20, "beam_width": 15}, "light.to_world", False),
-        ({"type": "spot", "texture": {"type": "checkerboard"}}, "light.to_world", True),
-        ({"type": "projector", "irradiance": 1.0}, "light.to_world", True),
+        ({"type": "spot", "texture": {"type": "checkerboard"}}, "light.to_world", False),
+        ({"type": "projector", "irradiance": 1.0}, "light.to_world", False),
         ({"type": "projector", "irradiance": 1.0}, "light.scale", False),
         ({"type": "sunsky"}, CAMERA, True),
         ({"type": "sunsky"}, "floor.to_world", False),
@@ -417,6 +418,21 @@ def test_emitters_with_steps(emitter, moving, warned):
     if warned:
         with pytest.warns(UnsupportedWarning, match="'light'"):
             require_supported(facts)
+
+
+@pytest.mark.parametrize("light, steps, pose", [
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, ("the rim of its cone",), True),
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 15}, (), False),
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 20, "sampling_weight": 0.0}, (), False),  # lights nothing
+    ({"type": "spot", "texture": {"type": "checkerboard"}}, ("checkerboard",), True),
+    ({"type": "projector", "irradiance": 1.0}, ("its frame",), True),
+    ({"type": "projector", "irradiance": {"type": "checkerboard"}}, ("its frame", "checkerboard"), True),
+])  # fmt: skip
+def test_steps_that_a_light_brings_along(light, steps, pose):
+    """Where it has any, what opens its cone counts as a pose: it moves them."""
+    moving = "light.to_world" if light["type"] == "projector" else "light.cutoff_angle"
+    emitter = named(facts_of(load(light=light), moving), "light")
+    assert tuple(step.split(" '")[0] for step in emitter.steps) == steps and bool(emitter.pose) == pose
 
 
 def test_moving_texture_coordinates_slide_steps():
