@@ -62,7 +62,7 @@ class Tubes:
                 if flat is not None and dr.grad_enabled(flat):
                     mine = active & (owner == k)
                     # from each shape's own array: a gradient does not leave a loop through a concatenation
-                    own = [dr.gather(mi.Vector4f, flat, first + (j - offset), mine) for j in range(4)]
+                    own = [dr.gather(mi.Vector4f, flat, first - offset + j, mine) for j in range(4)]
                     p = [dr.select(mine, a, b) for a, b in zip(own, p, strict=True)]
         return Axis.of(p, v)
 
