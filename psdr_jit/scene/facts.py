@@ -215,8 +215,8 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
-    known = (lambda found: found) if kind == "curve" else missing_patterns  # of a curve, no steps are edges
-    missing = known(steps)
+    # of the steps on a curve, none are edges
+    missing, jumps = (steps, jumps) if kind == "curve" else (missing_patterns(steps), missing_patterns(jumps))
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,
@@ -237,7 +237,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
-        jumps=known(jumps),
+        jumps=jumps,
         sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),

@@ -42,7 +42,7 @@ def scene_of(**objects) -> mi.Scene:
 def assert_gain(scene: mi.Scene, param: str, step: float, **how):
     motion, spec = perturb(scene, param, **how), {"type": "psdr_path", "max_depth": 2}
     reference = fd(motion, spec, step, 32, 512)
-    slope = gain(forward(motion, spec, 8, 512), reference[0::2], reference[1::2])
+    slope = gain(forward(motion, spec, 16, 512), reference[0::2], reference[1::2])
     assert slope.stderr < 0.015, slope
     assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
 
