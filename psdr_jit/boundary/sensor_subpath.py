@@ -33,6 +33,7 @@ from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
 from ..paths.rays import SHADOW_EPSILON, skip_emitters
 from ..paths.scattering import UNIFORM_SHARE
+from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
@@ -226,7 +227,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     path = PathState.start(1)
     active = mi.Bool(True)
     while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits]):
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         end = _connect(job, sampler, si, bsdf, value * path.β, active)
         onward = bounce(si, bsdf, sampler, path, limits, ctx, active)

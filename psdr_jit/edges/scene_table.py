@@ -28,6 +28,7 @@ from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
 from .kind_shading import ShadingOutlines
+from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
@@ -53,7 +54,7 @@ def edge_table(job: Job) -> EdgeTable:
     """All edges of the scene, those that no path can reach left out."""
     shapes = job.scene.shapes()
     chosen = [s for s in job.facts.shapes if s.index >= 0]
-    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
+    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if s.plugin in CURVES_OF]
     pairs = crossing([box_of(shapes[s.index]) for s in chosen])
     warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
     overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
@@ -63,6 +64,8 @@ def edge_table(job: Job) -> EdgeTable:
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
+    if job.tubes is not None:
+        kinds.append(TubeOutlines(job.tubes, tube_rows(job.tubes), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)

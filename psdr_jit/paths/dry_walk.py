@@ -53,7 +53,7 @@ def _follow(
     active = pi.is_valid() & (path.k + 1 < limits.max_depth)
     while dr.hint(active, label="psdr.dry_walk", exclude=[limits]):
         stopped |= stop(pi, active)
-        si = interaction(pi, ray, limits.own_frames)
+        si = interaction(pi, ray, limits)
         sampler.next_2d()  # spent on emitter sampling in `walk`
         onward = bounce(si, si.bsdf(), sampler, path, limits, ctx, active)
         path = onward.path

@@ -15,7 +15,9 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
+from ..paths.tube_surface import surface_at
 from ..scene.facts import SceneFacts
+from ..scene.tubes import Tubes
 from .motion import Displacements, Motion
 
 #: Direction of the shift and axis of the turn: none that a scene is likely to be aligned with, nor with each other.
@@ -32,6 +34,7 @@ class ProbeMotion(Motion):
     centre: mi.Point3f
     shift: mi.Vector3f
     turn: mi.Vector3f  # as fast at the rim of what moves as the shift
+    tubes: Tubes | None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
@@ -96,14 +99,17 @@ class ProbeDisplacements(Displacements):
         ray = mi.Ray3f(ray)
         ray.o = ray.o - self._of_point(hit.o, moving)
         ray.d = ray.d - dr.cross(w, hit.d)
-        si = pi.compute_surface_interaction(ray, flags)
+        si = surface_at(self.probe.tubes, pi, ray, flags)
         si.p = si.p + self._of_point(si.p, moving)
         si.n, si.sh_frame = _turned(si, w)
         return si
 
-    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
+    def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        follow = mi.RayFlags.All | mi.RayFlags.FollowShape
+        si = surface_at(self.probe.tubes, hit.intersection(), ray, follow, active)
         si.p = si.p + self._of_point(si.p, self.probe.takes_part(hit.shape))
         si.n, si.sh_frame = _turned(si, self._turn_of(hit.shape))
+        return si
 
     def of_lights(self) -> mi.Vector3f:
         return self.v if self.probe.lights else mi.Vector3f(0)
@@ -115,7 +121,7 @@ def _turned(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> tuple[mi.Normal3f, m
     return mi.Normal3f(si.n + dr.cross(w, dr.detach(si.n))), frame
 
 
-def probe_motion(scene: mi.Scene, facts: SceneFacts) -> ProbeMotion:
+def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None) -> ProbeMotion:
     """The probe of a scene, about the middle of what moves."""
     moving = {shape.index for shape in facts.shapes if shape.moves and shape.index >= 0}
     box = mi.ScalarBoundingBox3f()
@@ -130,6 +136,7 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts) -> ProbeMotion:
         varying(mi.Point3f, list(sphere.center)),
         varying(mi.Vector3f, list(SHIFT)),
         varying(mi.Vector3f, turn),
+        tubes,
     )
 
 

@@ -38,13 +38,15 @@ PLUGIN_NAMES = {
 
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
+CURVE_SHAPES = frozenset({"bsplinecurve"})
+"""Tubes about splines (`scene.tubes`)."""
+
 UNSUPPORTED_SHAPES = {
     "instance": "load the mesh once per copy instead of instancing it",
     "shapegroup": "load the mesh once per copy instead of instancing it",
     "sdfgrid": "extract a mesh, for example with marching cubes",
     "ellipsoids": "use meshes",
     "ellipsoidsmesh": "use meshes",
-    "bsplinecurve": "tessellate the curves into a mesh",
     "linearcurve": "tessellate the curves into a mesh",
 }
 """Shapes without an edge set: plugin -> the way out."""
@@ -96,8 +98,9 @@ SUPPORT = (
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
         "faces: warning"),
-    Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
-    Row("SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("rectangle, disk, sphere, cylinder, B-spline curve", "yes",
+        "stretched or sheared spheres and cylinders: error"),
+    Row("SDF grids, ellipsoids, linear curves", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "error", "materials as well: load the mesh once per copy"),
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
@@ -125,7 +128,8 @@ SUPPORT = (
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
         "the curve where they meet, also of separate parts of one mesh"),
-    Row("cylinders, disks and spheres that cut into other shapes", "warning", "the pair is named; meshes do instead"),
+    Row("cylinders, disks, spheres and curves that cut into other shapes", "warning",
+        "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
     Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),
 )  # fmt: skip

@@ -13,7 +13,14 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, CONE_PARAMETERS, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
+from .capabilities import (
+    ANALYTIC_SHAPES,
+    CONE_PARAMETERS,
+    CURVE_SHAPES,
+    POSE_PARAMETERS,
+    UNIFORM_EMITTERS,
+    UNSUPPORTED_SHAPES,
+)
 from .graph import (
     SceneGraph,
     blends_delta,
@@ -37,7 +44,7 @@ class ShapeFacts:
     name: str
     index: int  # in scene.shapes(); -1 inside a shape group
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic" or "unsupported"
+    kind: str  # "mesh", "analytic", "curve" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -212,14 +219,17 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     shading = tuple(name for name in enabled if _only_shades(name))
     jumps = jumping_textures(graph, bsdf)
     steps = jumps + jumping_textures(graph, shape.emitter())
-    missing = missing_patterns(steps)
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
     if plugin in UNSUPPORTED_SHAPES:
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
         kind = "analytic"
+    elif plugin in CURVE_SHAPES:
+        kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
+    # of the steps on a curve, none are edges
+    missing, jumps = (steps, jumps) if kind == "curve" else (missing_patterns(steps), missing_patterns(jumps))
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,
@@ -240,7 +250,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
-        jumps=missing_patterns(jumps),
+        jumps=jumps,
         sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),

@@ -303,8 +303,7 @@ def exotic_shapes(folder):
     }
 
 
-@pytest.mark.parametrize("plugin", ["instance", "sdfgrid", "ellipsoids", "ellipsoidsmesh", "bsplinecurve",
-                                    "linearcurve"])  # fmt: skip
+@pytest.mark.parametrize("plugin", ["instance", "sdfgrid", "ellipsoids", "ellipsoidsmesh", "linearcurve"])
 def test_shapes_without_edges(plugin, tmp_path):
     objects = exotic_shapes(tmp_path)[plugin]
     for moving in ("floor.to_world", "lamp.position", CAMERA):
