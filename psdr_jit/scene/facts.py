@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
+from .capabilities import ANALYTIC_SHAPES, INSTANCING, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
 from .graph import (
     SceneGraph,
     blends_delta,
@@ -27,6 +27,7 @@ from .graph import (
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
+from .instances import require_codes, shape_groups
 from .patterns import missing_patterns
 
 
@@ -36,8 +37,9 @@ class ShapeFacts:
 
     name: str
     index: int  # in scene.shapes(); -1 inside a shape group
+    group: str  # id of the shape group that it is in, "" if it is in none
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic" or "unsupported"
+    kind: str  # "mesh", "analytic", "instance" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -175,14 +177,17 @@ def analyse(
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         graph = SceneGraph(scene, sensor, counts)
         scene_shapes = list(scene.shapes())
-        shapes = scene_shapes + [s for s in graph.shapes_in_groups() if s not in scene_shapes]
+        groups = shape_groups(graph.nodes())
+        require_codes([s for s in scene_shapes if plugin_name(s) in INSTANCING], groups)
+        places = [(shape, i, "") for i, shape in enumerate(scene_shapes)]
+        places += [(shape, -1, name) for name, members in groups.items() for shape in members]
+        shapes = [shape for shape, _, _ in places]
         bad_vertices = non_finite_vertices(shapes)
         return SceneFacts(
             variant=mi.variant(),
             polarized=mi.is_polarized,
             shapes=tuple(
-                _shape_facts(graph, shape, i if i < len(scene_shapes) else -1, bad_vertices[i])
-                for i, shape in enumerate(shapes)
+                _shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)
             ),
             emitters=tuple(
                 _emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
@@ -199,7 +204,7 @@ def _extent(scene: mi.Scene) -> float:
     return math.dist(box.max, box.min) if box.valid() else 0.0
 
 
-def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: int) -> ShapeFacts:
+def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad_vertices: int) -> ShapeFacts:
     others = (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium, mi.Shape)  # what is left are texture attributes
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
@@ -208,7 +213,9 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     steps = jumps + jumping_textures(graph, shape.emitter())
     missing = missing_patterns(steps)
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
-    if plugin in UNSUPPORTED_SHAPES:
+    if plugin in INSTANCING:
+        kind = "instance"
+    elif plugin in UNSUPPORTED_SHAPES:
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
         kind = "analytic"
@@ -217,6 +224,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,
+        group=group,
         plugin=plugin,
         kind=kind,
         is_mesh=is_mesh,

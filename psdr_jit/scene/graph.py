@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_positions
-from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
-from .names import traverse
+from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, SMOOTH_PARAMETERS
+from .names import plugin_name, traverse
 from .params import parameter_value
 
 HARD_EDGE = 1e-3
@@ -97,10 +97,8 @@ class SceneGraph:
         known = self._children.get(id(node))
         return child_objects(node) if known is None else known
 
-    def shapes_in_groups(self) -> list[mi.Shape]:
-        """The shapes that are visible through instances only."""
-        groups = [n for n in self._nodes if plugin_name(n) == "shapegroup"]
-        return [n for group in groups for n in self.walk(group) if isinstance(n, mi.Shape) and n is not group]
+    def nodes(self) -> list[mi.Object]:
+        return list(self._nodes)
 
     def name(self, node: mi.Object, index: int) -> str:
         """The id given in the scene file, or the plugin and a number."""
@@ -141,12 +139,6 @@ def _last(name: str) -> str:
 
 def _grad_enabled(value) -> bool:
     return value is not None and not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
-
-
-def plugin_name(node: mi.Object) -> str:
-    """The name that creates this object in a scene file; the C++ class name if it is not known."""
-    known = node.class_name().split("[")[0]  # "BitmapTextureImpl[float32]"
-    return PLUGIN_NAMES.get(known, known)
 
 
 def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
@@ -249,9 +241,12 @@ def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
     if plugin not in ("sphere", "cylinder"):
         return False
     matrix = _host(graph.value(shape, "to_world").matrix)
-    if matrix is None:
-        return False
-    axes = matrix.reshape(4, 4)[:3, :3]
+    return matrix is not None and stretches(matrix.reshape(4, 4), plugin)
+
+
+def stretches(matrix: np.ndarray, plugin: str) -> bool:
+    """Whether this object-to-world map (4, 4) makes an ellipsoid of a sphere, or an ellipse of a cylinder's circle."""
+    axes = matrix[:3, :3]
     length = np.linalg.norm(axes, axis=0)
     round_axes = length if plugin == "sphere" else length[:2]
     gram = (axes / np.maximum(length, np.finfo(np.float32).tiny)).T @ axes / length.max()
