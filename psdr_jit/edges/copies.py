@@ -24,7 +24,7 @@ from ..core.compat import (
 )
 from ..errors import UnsupportedError
 from ..scene.capabilities import COPIES
-from ..scene.graph import stretches
+from ..scene.graph import named_children, stretches
 
 #: Attributes of meshes, by the first part of their names.
 ATTRIBUTES = ("vertex_", "face_")
@@ -45,8 +45,18 @@ def attributes(mesh: mi.Mesh) -> dict[str, mi.Float]:
     return {key: params[key] for key in params.keys() if key.startswith(ATTRIBUTES) and key not in usual}
 
 
+def _textures(shape: mi.Shape) -> dict[str, mi.Texture]:
+    """Textures that a shape has in place of attributes."""
+    return {name: node for name, node in named_children(shape) if isinstance(node, mi.Texture)}
+
+
 def _matrix(to_world) -> np.ndarray:
     return np.array(dr.detach(to_world.matrix), float).reshape(4, 4)
+
+
+def _volume(matrix: np.ndarray) -> float:
+    """By how much the map scales volumes; negative if it mirrors."""
+    return float(np.linalg.det(matrix[:3, :3]))
 
 
 def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
@@ -61,7 +71,10 @@ def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
         count = child.vertex_count() if key.startswith("vertex_") else child.face_count()
         values = np.array(dr.detach(buffer)).ravel()
         copy.add_attribute(key, len(values) // count, values)
-    params, volume = mi.traverse(copy), float(np.linalg.det(_matrix(to_world)[:3, :3]))
+    for key, texture in _textures(child).items():
+        copy.add_texture_attribute(key, texture)
+    copy.set_id(name)
+    params, volume = mi.traverse(copy), _volume(_matrix(to_world))
     params[VERTEX_POSITIONS] = pack_positions(to_world @ dr.detach(mesh_positions(child)))
     faces = mesh_faces(child)
     params[FACES] = dr.ravel(faces if volume > 0 else mi.Vector3u(faces.x, faces.z, faces.y))
@@ -75,11 +88,15 @@ def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
 
 
 def _analytic(child: mi.Shape, plugin: str, to_world, name: str) -> mi.Shape:
-    matrix = _matrix(to_world) @ _matrix(mi.traverse(child)["to_world"])
+    own = _matrix(mi.traverse(child)["to_world"])
+    matrix = _matrix(to_world) @ own
     if stretches(matrix, plugin):
         raise UnsupportedError(
             f"'{name}': the instance stretches or shears a {plugin}, whose outline is not modelled then; scale it "
             "evenly, or use a mesh"
         )
+    # A map that mirrors turns a sphere inside out, which an instance does not. A tube only says that it is flipped.
+    mirrors = {"sphere": matrix, "cylinder": own}.get(plugin)
+    flipped = child.has_flipped_normals() ^ (mirrors is not None and _volume(mirrors) < 0)
     place = {"type": plugin, "id": name, "to_world": mi.ScalarTransform4f(matrix)}
-    return mi.load_dict({**place, "bsdf": child.bsdf(), "flip_normals": child.has_flipped_normals()})
+    return mi.load_dict({**place, **_textures(child), "bsdf": child.bsdf(), "flip_normals": flipped})

@@ -74,11 +74,12 @@ def _found(job: Job) -> EdgeShapes:
 def _group(memory: Memory, index: int, instance: mi.Shape, groups: dict[str, list[mi.Shape]]) -> str:
     """Id of the group that an instance shows: always the same, and slow to ask for."""
     known = memory[GROUPS].get(index)
-    if known is None or known[0] is not instance:
+    if known is None or known[0] is not instance or known[1] not in groups:
         known = (instance, group_of(instance))
         memory[GROUPS][index] = known
     if known[1] not in groups:
-        raise UnsupportedError(f"instance '{instance.id()}' shows a shapegroup without an id; give it one, or {COPIES}")
+        text = f"instance '{instance.id()}' shows shapegroup '{known[1]}', which the scene does not have"
+        raise UnsupportedError(f"{text}; {COPIES}")
     return known[1]
 
 

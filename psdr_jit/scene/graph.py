@@ -108,10 +108,11 @@ class SceneGraph:
 
 def child_objects(node: mi.Object) -> list[mi.Object]:
     """The objects that `node` refers to directly, in the order in which it names them."""
-    return [child for _, child in _named_children(node)]
+    return [child for _, child in named_children(node)]
 
 
-def _named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
+def named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
+    """The objects that `node` refers to directly, with the names that it gives them."""
     callback = _children_callback()()
     node.traverse(callback)
     return callback.found
@@ -167,7 +168,7 @@ def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tup
             continue
         own = [
             child
-            for name, child in _named_children(node)
+            for name, child in named_children(node)
             if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
         ]
         for child in own:
@@ -246,6 +247,8 @@ def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
 
 def stretches(matrix: np.ndarray, plugin: str) -> bool:
     """Whether this object-to-world map (4, 4) makes an ellipsoid of a sphere, or an ellipse of a cylinder's circle."""
+    if plugin not in ("sphere", "cylinder"):
+        return False
     axes = matrix[:3, :3]
     length = np.linalg.norm(axes, axis=0)
     round_axes = length if plugin == "sphere" else length[:2]

@@ -339,11 +339,12 @@ def test_what_is_instanced_must_not_move(moving, name):
 
 
 def test_groups_must_be_told_apart():
-    groups = {name: mi.load_dict(GROUP) for name in "ab"}
-    for group in groups.values():
-        group.set_id("twice")
+    scene = load(a=GROUP, b=GROUP)
+    for node in mi.traverse(scene).hierarchy:
+        if node.id() in ("a", "b"):
+            node.set_id("twice")
     with pytest.raises(UnsupportedError, match="give each an id"):
-        facts_of(load(**groups), NOTHING_MOVES)
+        facts_of(scene, NOTHING_MOVES)
 
 
 def test_media_are_refused_always():
