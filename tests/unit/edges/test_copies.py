@@ -74,7 +74,8 @@ def test_a_record_finds_its_surface_again(llvm):
 @pytest.mark.parametrize("kind", ["cube", "smooth", "disk", "sphere", "cylinder", "mirrored sphere", "mirrored tube"])
 def test_a_copy_is_what_the_instance_shows(llvm, kind, scale):
     kind, own = MIRRORED.get(kind, kind), mi.ScalarTransform4f().scale((-1, 1, 1) if kind in MIRRORED else (1, 1, 1))
-    scene = scene_of(scale, part=smooth() if kind == "smooth" else mi.load_dict({"type": kind, "to_world": own, "paint": PAINT}))
+    part = smooth() if kind == "smooth" else mi.load_dict({"type": kind, "to_world": own, "paint": PAINT})
+    scene = scene_of(scale, part=part)
     (shown,) = [s for s in scene.shapes() if s.id() == "shown"]
     (child,) = shape_groups(mi.traverse(scene).hierarchy)[group_of(shown)]
     if kind in ("sphere", "cylinder") and scale[1] != 1:
