@@ -17,6 +17,7 @@ from ..core.records import Hit
 from ..core.varying import varying
 from ..paths.tube_surface import surface_at
 from ..scene.facts import SceneFacts
+from ..scene.instances import is_instance
 from ..scene.tubes import Tubes
 from .motion import Displacements, Motion
 
@@ -29,6 +30,7 @@ class ProbeMotion(Motion):
     """v(x) = shift + turn × (x − centre), and who takes part. Detached."""
 
     moving: mi.UInt32  # by registry index of a shape: 1 if it can move
+    known: mi.UInt32  # number of its entries: what instances show, and copies of it for edges, rest
     camera: bool
     lights: bool  # those without a shape
     centre: mi.Point3f
@@ -52,8 +54,8 @@ class ProbeMotion(Motion):
         return self.shift + dr.cross(self.turn, o - self.centre), dr.cross(self.turn, d)
 
     def takes_part(self, shape: mi.UInt32) -> mi.Bool:
-        """By registry index; 0, no shape, does not."""
-        return dr.gather(mi.UInt32, self.moving, shape, shape != 0) != 0
+        """By the code of a surface; 0, no shape, does not."""
+        return dr.gather(mi.UInt32, self.moving, shape, (shape != 0) & (shape < self.known)) != 0
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,10 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None)
         box.expand(scene.shapes()[index].bbox())
     sphere = (box if box.valid() else scene.bbox()).bounding_sphere()
     turn = [a / max(float(sphere.radius), 1e-6) for a in AXIS]
+    table = registry_table(scene, moving)
     return ProbeMotion(
-        registry_table(scene, moving),
+        table,
+        varying(mi.UInt32, dr.width(table)),
         facts.camera_moves,
         facts.emitters_move,
         varying(mi.Point3f, list(sphere.center)),
@@ -141,9 +145,11 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None)
 
 
 def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
-    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`."""
+    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`; −1: every instance."""
     ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
     table = [0] * (max(ids, default=0) + 1)
+    if -1 in chosen:
+        chosen = chosen | {k for k, shape in enumerate(scene.shapes()) if is_instance(shape)}
     for index in chosen:
         if index >= 0:
             table[ids[index]] = 1

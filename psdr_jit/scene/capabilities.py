@@ -42,8 +42,6 @@ CURVE_SHAPES = frozenset({"bsplinecurve"})
 """Tubes about splines (`scene.tubes`)."""
 
 UNSUPPORTED_SHAPES = {
-    "instance": "load the mesh once per copy instead of instancing it",
-    "shapegroup": "load the mesh once per copy instead of instancing it",
     "sdfgrid": "extract a mesh, for example with marching cubes",
     "ellipsoids": "use meshes",
     "ellipsoidsmesh": "use meshes",
@@ -52,7 +50,10 @@ UNSUPPORTED_SHAPES = {
 """Shapes without an edge set: plugin -> the way out."""
 
 INSTANCING = frozenset({"instance", "shapegroup"})
-"""Refused even if nothing moves: a recorded path vertex does not know which instance it is on."""
+"""Shapes that show others. The edges of what they show are found; that these move is not modelled."""
+
+COPIES = "load the mesh once per copy instead of instancing it"
+"""The way out of what instances cannot do."""
 
 SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 """Sensors whose film position of a scene point is known, so that edges can be projected."""
@@ -101,7 +102,8 @@ SUPPORT = (
     Row("rectangle, disk, sphere, cylinder, B-spline curve", "yes",
         "stretched or sheared spheres and cylinders: error"),
     Row("SDF grids, ellipsoids, linear curves", "error", _MOVING + "materials and radiance are fine"),
-    Row("instances", "error", "materials as well: load the mesh once per copy"),
+    Row("instances", "yes",
+        "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
     Row("perspective, thin lens, orthographic sensor", "yes", ""),

@@ -14,7 +14,7 @@ from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
-from .capabilities import CONE_PARAMETERS, INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+from .capabilities import CONE_PARAMETERS, COPIES, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
 from .facts import SceneFacts, ShapeFacts
 from .size import loss_by_offsets, overflow
 
@@ -116,10 +116,6 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
         yield Finding(UnsupportedError, "", "the scene has no shapes: there is nothing to scatter light; add one")
     for shape in facts.shapes:
         label = f"shape '{shape.name}' ({shape.plugin})"
-        if shape.plugin in INSTANCING:
-            text = f"{label}: no term knows on which instance a path was; {UNSUPPORTED_SHAPES[shape.plugin]}"
-            yield Finding(UnsupportedError, shape.name, text)
-            continue
         if shape.bad_vertices:
             yield Finding(
                 SceneError, shape.name,
@@ -143,6 +139,19 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} is stretched or sheared, which Mitsuba renders as an unstretched one; scale it "
                 "evenly, or use a mesh",
             )  # fmt: skip
+
+
+def check_instances(facts: SceneFacts) -> Iterator[Finding]:
+    """What is instanced rests: Mitsuba does not turn the normals of an instance that moves."""
+    for shape in facts.shapes:
+        if not shape.moves or (shape.kind != "instance" and not shape.group):
+            continue
+        what = "an instance" if shape.kind == "instance" else f"a shape of shapegroup '{shape.group}'"
+        yield Finding(
+            UnsupportedError, shape.name,
+            f"shape '{shape.name}' ({shape.plugin}) is {what} that moves ({', '.join(shape.geometry)}), which is not "
+            f"modelled: instances take part while something else is differentiated; {COPIES}",
+        )  # fmt: skip
 
 
 def check_specular(facts: SceneFacts) -> Iterator[Finding]:
@@ -241,6 +250,7 @@ CHECKS = (
     check_media,
     check_sensor,
     check_shapes,
+    check_instances,
     check_specular,
     check_delta_weights,
     check_extent,

@@ -15,12 +15,11 @@ import mitsuba as mi
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
 from .capabilities import (
     ANALYTIC_SHAPES,
-    CONE_PARAMETERS,
     CURVE_SHAPES,
-    POSE_PARAMETERS,
-    UNIFORM_EMITTERS,
+    INSTANCING,
     UNSUPPORTED_SHAPES,
 )
+from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
     blends_delta,
@@ -29,12 +28,12 @@ from .graph import (
     jumping_textures,
     non_finite_vertices,
     plugin_name,
-    rim_of_cone,
     sees_frame,
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
-from .patterns import missing_patterns, steps_of_light
+from .instances import require_codes, shape_groups
+from .patterns import missing_patterns
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,9 @@ class ShapeFacts:
 
     name: str
     index: int  # in scene.shapes(); -1 inside a shape group
+    group: str  # id of the shape group that it is in, "" if it is in none
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic", "curve" or "unsupported"
+    kind: str  # "mesh", "analytic", "curve", "instance" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -74,23 +74,6 @@ class ShapeFacts:
     def opaque(self) -> bool:
         """No light passes through the surface."""
         return not self.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
-
-
-@dataclass(frozen=True)
-class EmitterFacts:
-    """One light source. The pose of an area light is its shape's geometry and is not repeated here."""
-
-    name: str
-    plugin: str  # as written in XML, for example "area" or "envmap"
-    shape: int  # index in SceneFacts.shapes, -1 if it has none
-    delta: bool  # a point or a direction: reached by emitter sampling only
-    infinite: bool
-    varies: bool  # what is seen of it directly differs from point to point or with the direction
-    rim: str  # of a spot's cone, see `graph.rim_of_cone`
-    steps: tuple[str, ...]  # of a projector or spot: steps of its light that are edges, "its frame", "bitmap 'slide'"
-    jumps: tuple[str, ...]  # other discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
-    pose: tuple[str, ...]  # enabled parameters that move it, or its steps
-    radiance: tuple[str, ...]  # all other enabled parameters
 
 
 @dataclass(frozen=True)
@@ -188,17 +171,20 @@ def analyse(
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         graph = SceneGraph(scene, sensor, counts)
         scene_shapes = list(scene.shapes())
-        shapes = scene_shapes + [s for s in graph.shapes_in_groups() if s not in scene_shapes]
+        groups = shape_groups(graph.nodes())
+        require_codes([s for s in scene_shapes if plugin_name(s) in INSTANCING], groups)
+        places = [(shape, i, "") for i, shape in enumerate(scene_shapes)]
+        places += [(shape, -1, name) for name, members in groups.items() for shape in members]
+        shapes = [shape for shape, _, _ in places]
         bad_vertices = non_finite_vertices(shapes)
         return SceneFacts(
             variant=mi.variant(),
             polarized=mi.is_polarized,
             shapes=tuple(
-                _shape_facts(graph, shape, i if i < len(scene_shapes) else -1, bad_vertices[i])
-                for i, shape in enumerate(shapes)
+                _shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)
             ),
             emitters=tuple(
-                _emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
+                emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
             ),
             sensor=_sensor_facts(graph, sensor),
             enabled=graph.enabled_names(),
@@ -212,7 +198,7 @@ def _extent(scene: mi.Scene) -> float:
     return math.dist(box.max, box.min) if box.valid() else 0.0
 
 
-def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: int) -> ShapeFacts:
+def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad_vertices: int) -> ShapeFacts:
     others = (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium, mi.Shape)  # what is left are texture attributes
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
@@ -220,7 +206,9 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     jumps = jumping_textures(graph, bsdf)
     steps = jumps + jumping_textures(graph, shape.emitter())
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
-    if plugin in UNSUPPORTED_SHAPES:
+    if plugin in INSTANCING:
+        kind = "instance"
+    elif plugin in UNSUPPORTED_SHAPES or (group and plugin in CURVE_SHAPES):
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
         kind = "analytic"
@@ -233,6 +221,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,
+        group=group,
         plugin=plugin,
         kind=kind,
         is_mesh=is_mesh,
@@ -262,30 +251,6 @@ def _only_shades(parameter: str) -> bool:
     """Whether a mesh parameter leaves the surface where it is."""
     attribute = parameter.startswith(("vertex_", "face_")) and parameter != VERTEX_POSITIONS
     return attribute or parameter in (VERTEX_NORMALS, VERTEX_TEXCOORDS)
-
-
-def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: list) -> EmitterFacts:
-    enabled, plugin = graph.enabled_of(emitter), plugin_name(emitter)
-    flags = emitter.flags()
-    owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
-    name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
-    jumps, rim = jumping_textures(graph, emitter), rim_of_cone(graph, emitter)
-    steps = steps_of_light(emitter, plugin, rim, jumps)
-    moving = POSE_PARAMETERS | (CONE_PARAMETERS if steps else frozenset())
-    pose = tuple(name for name in enabled if name in moving)
-    return EmitterFacts(
-        name=name,
-        plugin=plugin,
-        shape=owners[0] if owners else -1,
-        delta=bool(flags & int(mi.EmitterFlags.Delta)),
-        infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
-        varies=plugin not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
-        rim=rim,
-        steps=steps,
-        jumps=missing_patterns(jumps) if steps or (owners and plugin == "area") else jumps,
-        pose=pose,
-        radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
-    )
 
 
 def _sensor_facts(graph: SceneGraph, sensor: mi.Sensor) -> SensorFacts:
