@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -21,6 +24,13 @@ def activate(name: str) -> str:
         mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)
     return name
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_scenes_left() -> Iterator[None]:
+    """Dr.Jit's virtual calls reach every scene that is alive, also one that waits in a reference cycle."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])

@@ -12,16 +12,18 @@ edge's material velocity, u_S the emitter point's (the interior term keeps emitt
 the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
-Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both.
+Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
+brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core import film as films
 from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
@@ -35,13 +37,15 @@ from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.relevance import SecondaryEdges, line_weights
+from ..sampling.light_steps import light_step_weights
+from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
 from . import segment_motion
 from .light_lines import LightLine, sample_light_lines
+from .light_steps import ESTIMATOR as LIGHT_STEPS
 from .segment_motion import BoundarySamples, SecondaryTerm
-from .sensor_subpath import UNLIMITED_VERTICES, Receivers, recorded_vertices, subpaths
+from .sensor_subpath import Receivers, longest_from_light, subpaths
 
 NAME = "direct"
 
@@ -137,8 +141,9 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:
     """What the segments are worth at the sensor: their subpaths are recorded."""
     a = -(1 - segment.ratio) * segment.n_perp
-    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value / segment.pdf, a, 0 * a)
-    records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_subpath(job))
+    value, still = segment.value / segment.pdf, mi.Vector3f(0)
+    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, value, a, still)
+    records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_from_light(job))
     return BoundarySamples(
         at=segment.at,
         ω=segment.ω,
@@ -167,19 +172,33 @@ def source_motion(job: Job, segment: BoundarySegment, moving: Displacements) -> 
     return moved
 
 
-def longest_subpath(job: Job) -> int:
-    """Vertices from the sensor to the receiver, at most: one segment is left for the emitter."""
-    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
-
-
-ESTIMATOR = SecondaryTerm(
-    name=NAME,
-    use=Use.SHADOW,
-    longest=longest_subpath,
+SHADOWS = SecondaryTerm(
+    edges=lambda job: secondary_edges(job, NAME, Use.SHADOW),
+    longest=longest_from_light,
     sample=sample,
     trace=trace,
     evaluate=evaluate,
 )
+
+
+def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
+    """What the term consists of, each with its share of the samples: shadows, and steps that lights bring along."""
+    if not job.facts.has_light_steps:
+        return [(SHADOWS, job)]
+    with dr.suspend_grad():
+        found = [part for part in (LIGHT_STEPS, SHADOWS) if part.edges(job) is not None]
+    return [(part, replace(job, spp=max(1, job.spp // len(found)))) for part in found]
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the term along the tangents set on the scene's parameters. Detached."""
+    return sum((segment_motion.forward(share, part) for part, share in parts(job)), films.black(job.film))
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`, same samples."""
+    for part, share in parts(job):
+        segment_motion.backward(share, part, grad_in)
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
@@ -188,6 +207,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, steps_rest(facts)
     if options.depth_limit < 2:
         return False, "max_depth = 1: nothing is lit, so nothing is in shadow"
+    if facts.has_light_steps:
+        return True, "shadows move, and so do steps that lights bring along"
     if geometry.lone_convex:
         return False, f"'{geometry.lone_convex}' is alone and convex: it casts no shadow on anything"
     if all(e.delta for e in facts.emitters):
@@ -203,12 +224,13 @@ def cost(form: str, sky: bool) -> float:
 TERM = Term(
     name=NAME,
     budget="sppd",
-    streams=(Stream.DIRECT_EDGE, Stream.DIRECT_SUBPATH),
+    streams=(Stream.DIRECT_EDGE, Stream.DIRECT_SUBPATH, Stream.LIGHT_STEP, Stream.LIGHT_STEP_SUBPATH),
     needed=needed,
     cost=cost,
-    forward=lambda job: segment_motion.forward(job, ESTIMATOR),
-    backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATOR, grad_in),
+    forward=forward,
+    backward=backward,
     edges=EdgeSampling(
-        lambda job: line_weights(job, ESTIMATOR.use), "no light sees the others as an outline, or they are coplanar"
+        lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job),
+        "no light sees the others as an outline, or they are coplanar",
     ),
 )

@@ -26,7 +26,7 @@ from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.relevance import SecondaryEdges, line_weights
+from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
 from . import indirect_material, segment_motion
 from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
@@ -89,19 +89,20 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     return radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission)
 
 
+#: What its lines are drawn for, by form.
+USES = {"spatial": Use.STEP, "material": Use.BACKGROUND}
+
 #: How the term is estimated, by form.
 ESTIMATORS = {
     "spatial": SecondaryTerm(
-        name=NAME,
-        use=Use.STEP,
+        edges=lambda job: secondary_edges(job, NAME, USES["spatial"]),
         longest=longest_subpath,
         sample=sample_lines,
         trace=lambda job, edges, line: trace_receivers(job, line),
         evaluate=evaluate,
     ),
     "material": SecondaryTerm(
-        name=NAME,
-        use=Use.BACKGROUND,
+        edges=lambda job: secondary_edges(job, NAME, USES["material"]),
         longest=longest_subpath,
         sample=sample_lines,
         trace=indirect_material.trace,
@@ -137,7 +138,7 @@ TERM = Term(
     forward=lambda job: segment_motion.forward(job, ESTIMATORS[job.form]),
     backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATORS[job.form], grad_in),
     edges=EdgeSampling(
-        lambda job: line_weights(job, ESTIMATORS[job.form].use),
+        lambda job: line_weights(job, USES[job.form]),
         "the others are coplanar, or lie inside of closed surfaces",
     ),
 )

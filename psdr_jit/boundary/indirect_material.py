@@ -58,7 +58,7 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
     # An edge that moves as the line turns does so as x_D and x_S move against each other: ω̇ = (v_S − u_D)/r_S.
     turn = edges.table.turn(v.sight.at, v.sight.ω, v.sight.n_perp) * (b.ratio / v.sight.r)
     a = -(1 - b.ratio) * v.sight.n_perp - turn
-    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a, 0 * a)
+    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a, mi.Vector3f(0))
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)

@@ -134,7 +134,8 @@ def _from_contour(
     pdf = dr.select(on_surface, dr.select(inv_pdf_area > 0, dr.rcp(inv_pdf_area), 0), ds_at_x.pdf)
     pmf = dr.select(inv_pmf > 0, dr.rcp(inv_pmf), 0)
     n_perp, across = on.across(ω)
-    return LightLine(on, n_perp, across, ω, dist, emitter, value, pdf * pmf, on.valid & (across > 0))
+    valid = on.valid & (across > 0) & kind.shades(row, on, ω, active)
+    return LightLine(on, n_perp, across, ω, dist, emitter, value, pdf * pmf, valid)
 
 
 def _normal_of(ps: mi.PositionSample3f, emitter: mi.EmitterPtr, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:

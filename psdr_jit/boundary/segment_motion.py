@@ -21,13 +21,13 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
-from ..edges.kind import Use
 from ..edges.location import EdgeLocation
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
-from ..sampling.relevance import SecondaryEdges, secondary_edges
+from ..sampling.rows import SampledRows
 from .sensor_subpath import SubpathRecords
 
+E = TypeVar("E", bound=SampledRows)
 L = TypeVar("L")
 S = TypeVar("S")
 
@@ -46,15 +46,14 @@ class BoundarySamples:
 
 
 @dataclass(frozen=True)
-class SecondaryTerm(Generic[L, S]):
+class SecondaryTerm(Generic[E, L, S]):
     """How one secondary boundary is estimated. Every step is detached."""
 
-    name: str  # of the term
-    use: Use  # what its lines are drawn for
+    edges: Callable[[Job], E | None]  # what it samples; None: nothing can contribute
     longest: Callable[[Job], int]  # vertices of the longest sensor subpath; < 1: there is nothing to estimate
-    sample: Callable[[Job, SecondaryEdges], L]  # lines through edge points
-    trace: Callable[[Job, SecondaryEdges, L], S | None]  # those that end where they should, with their ends
-    evaluate: Callable[[Job, SecondaryEdges, S], BoundarySamples]  # what they are worth
+    sample: Callable[[Job, E], L]  # lines through edge points
+    trace: Callable[[Job, E, L], S | None]  # those that end where they should, with their ends
+    evaluate: Callable[[Job, E, S], BoundarySamples]  # what they are worth
 
 
 @dataclass
@@ -67,7 +66,7 @@ class _Motion:
     camera: mi.Float
 
 
-def _motion(job: Job, edges: SecondaryEdges, s: BoundarySamples, moving: Displacements) -> _Motion:
+def _motion(job: Job, edges: SampledRows, s: BoundarySamples, moving: Displacements) -> _Motion:
     at_edge = dr.dot(s.n_perp, moving.of_edge(edges.table, s.at, s.ω)) + s.source_motion(moving)
     c = s.records.data
     surface = moving.of_surface(c.hit)
@@ -110,9 +109,9 @@ def backward(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:
             _accumulate_adjoint(part, term, share * grad_in)
 
 
-def _samples(job: Job, term: SecondaryTerm) -> tuple[SecondaryEdges, BoundarySamples] | None:
+def _samples(job: Job, term: SecondaryTerm) -> tuple[SampledRows, BoundarySamples] | None:
     """Sampled, traced and evaluated; None if nothing is left."""
-    edges = secondary_edges(job, term.name, term.use)
+    edges = term.edges(job)
     if edges is None:
         return None
     segments = term.trace(job, edges, term.sample(job, edges))

@@ -33,6 +33,7 @@ from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
 from ..paths.rays import SHADOW_EPSILON, skip_emitters
 from ..paths.scattering import UNIFORM_SHARE
+from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 from .delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
 
@@ -140,6 +141,11 @@ def recorded_vertices(job: Job, limit: int) -> int:
     return min(limit, 1) if only_camera and job.plan.prunes else limit
 
 
+def longest_from_light(job: Job) -> int:
+    """Vertices from the sensor to a receiver of light, at most: one segment is left for the emitter."""
+    return recorded_vertices(job, job.options.max_depth - 1 if job.options.max_depth != -1 else UNLIMITED_VERTICES)
+
+
 class _Flat:
     """A flat output array that a recorded loop scatters into, hidden from its state."""
 
@@ -239,7 +245,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     path = PathState.start(1)
     active = mi.Bool(True)
     while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits]):
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         end = _connect(job, sampler, si, bsdf, value * path.β, active)
         onward = bounce(si, bsdf, sampler, path, limits, ctx, active)

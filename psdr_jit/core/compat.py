@@ -18,6 +18,7 @@ VERTEX_POSITIONS = "positions" if INDEXED_MESHES else "vertex_positions"
 VERTEX_NORMALS = "normals" if INDEXED_MESHES else "vertex_normals"
 VERTEX_TEXCOORDS = "texcoords" if INDEXED_MESHES else "vertex_texcoords"
 FACES = "faces"
+CONTROL_POINTS = "control_points"  # of curves: x, y, z and radius of each, flat
 
 
 def mesh_positions(mesh: mi.Mesh) -> mi.Point3f:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .surface_code import set_surface, surface_code
+
 
 @dataclass
 class Hit:
@@ -18,18 +20,17 @@ class Hit:
     o: mi.Point3f  # ray origin, already offset from its surface [m]
     d: mi.Vector3f  # unit direction of travel, away from the sensor
     t: mi.Float  # distance to the surface [m]
-    shape: mi.UInt32  # registry index of the shape
+    shape: mi.UInt32  # its `surface_code`
     prim_index: mi.UInt32
     prim_uv: mi.Point2f
 
     @staticmethod
     def of(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> Hit:
-        valid = pi.is_valid()
         return Hit(
             o=mi.Point3f(ray.o),
             d=mi.Vector3f(ray.d),
             t=mi.Float(pi.t),
-            shape=dr.select(valid, dr.reinterpret_array(mi.UInt32, pi.shape), 0),
+            shape=surface_code(pi),
             prim_index=mi.UInt32(pi.prim_index),
             prim_uv=mi.Point2f(pi.prim_uv),
         )
@@ -50,7 +51,7 @@ class Hit:
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = self.shape != 0
         pi.t = dr.select(pi.valid, self.t, dr.inf)
-        pi.shape = dr.reinterpret_array(mi.ShapePtr, self.shape)
+        set_surface(pi, self.shape)
         pi.prim_index = self.prim_index
         pi.prim_uv = self.prim_uv
         return pi
@@ -61,7 +62,7 @@ class EmitterSample:
     """One next-event estimate: which emitter, where on it, and how likely. Detached."""
 
     emitter: mi.UInt32  # registry index, 0: none sampled, or occluded
-    shape: mi.UInt32  # where the shadow ray ended: shape (0 unless an area light) ...
+    shape: mi.UInt32  # where the shadow ray ended: `surface_code` (0 unless an area light) ...
     prim_index: mi.UInt32  # ... primitive ...
     prim_uv: mi.Point2f  # ... and position on it
     d: mi.Vector3f  # unit direction from the vertex to the emitter

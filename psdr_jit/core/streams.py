@@ -20,10 +20,12 @@ class Stream(IntEnum):
     INDIRECT_EDGE = 6
     INDIRECT_SUBPATH = 7
     INDIRECT_RADIANCE = 8
-    CHAIN_LINE = 9
-    CHAIN_LOBES = 10
-    CHAIN_CUTS = 11
-    CHAIN_RADIANCE = 12
+    LIGHT_STEP = 9
+    LIGHT_STEP_SUBPATH = 10
+    CHAIN_LINE = 11
+    CHAIN_LOBES = 12
+    CHAIN_CUTS = 13
+    CHAIN_RADIANCE = 14
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -11,17 +11,20 @@ import numpy as np
 ALIGNMENT = 64
 
 
-def uploaded(kind: type, values: np.ndarray) -> Any:
+def uploaded(kind: type, values: np.ndarray, beyond: int = 0) -> Any:
     """A flat Dr.Jit array of type `kind` (32-bit indices, floats or masks) with these values.
 
     On the CPU, Dr.Jit adopts NumPy's memory and compiles other kernels if it does not happen to be aligned.
+
+    `beyond`: how many times the last value stands behind the array, for who reads past its end; on the CPU alone.
     """
     values = np.asarray(values, _numpy_type(kind))
-    memory = np.empty(values.nbytes + ALIGNMENT, np.uint8)
+    room = np.append(values.ravel(), np.repeat(values.ravel()[-1:], beyond)) if beyond else values.ravel()
+    memory = np.empty(room.nbytes + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
-    aligned = memory[start : start + values.nbytes].view(values.dtype)
-    aligned[:] = values.ravel()
-    return kind(aligned)
+    aligned = memory[start : start + room.nbytes].view(values.dtype)
+    aligned[:] = room
+    return kind(aligned[: values.size])
 
 
 def _numpy_type(kind: type) -> Any:

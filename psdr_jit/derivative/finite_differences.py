@@ -21,6 +21,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages, block_means, standard_error
 from psdr_jit.errors import OptionError
+from psdr_jit.scene.curve_ends import pad_curves
 
 PIXEL_STEP = 0.1        # how far an edge moves to either side [px]; more smears the derivative image
 EXTENT_STEP = 0.0075    # upper bound for moving a shape, relative to its size
@@ -61,6 +62,7 @@ class CentralDifference:
             raise OptionError(f"eps must be positive, got {eps}")
         self.perturbation = perturbation
         self.scene = perturbation.scene
+        pad_curves(self.scene)
         self.sensor = self.scene.sensors()[sensor]
         self.integrator = integrator_specs.reference(spec)
         self.eps = eps or default_step(perturbation, self.sensor)

@@ -50,4 +50,5 @@ def _count(term: Term, job: Job) -> EdgeCount:
     with dr.suspend_grad():
         weights = term.edges.weights(job)
     sampled = sum(int(np.count_nonzero(np.array(w) > 0)) for w in weights)
-    return EdgeCount(sampled, table.count + table.buried, term.edges.left_out, table.buried)
+    total = sum(dr.width(w) for w in weights)
+    return EdgeCount(sampled, total + table.buried, term.edges.left_out, table.buried)

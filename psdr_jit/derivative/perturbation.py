@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.compat import CONTROL_POINTS
 from psdr_jit.errors import ParameterError
 from psdr_jit.scene.guard import require_scene
 from psdr_jit.scene.names import traverse
@@ -83,7 +84,8 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
             index: int | None = None) -> Perturbation:
     """The curve of parameter `name` along one direction; exactly one way to give it, or none for numbers.
 
-    - `direction=(dx, dy, dz)`: translation in world space, for `vertex_positions`, `to_world` and points;
+    - `direction=(dx, dy, dz)`: translation in world space, for `vertex_positions`, `control_points` (whose radii stay),
+      `to_world` and points;
     - `rotate=(ax, ay, az)`: world axis (normalised here), theta in radians, about the centre of the shape's
       bounding box, or about its own origin for a sensor or a lamp;
     - `index=i`: one scalar of the parameter in flat order;
@@ -102,12 +104,12 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     originals = {name: dr.detach(value) for name, value in values_to_keep(params, name).items()}
     base = originals[name]
     position = name.rsplit(".", 1)[-1] == "position"
-    movable = name.endswith("vertex_positions") or info.shape == (4, 4) or position
+    movable = name.endswith(("vertex_positions", CONTROL_POINTS)) or info.shape == (4, 4) or position
     common = dict(scene=scene, params=params, info=info, originals=originals)
     if movable and index is None and (rotate is not None or not _is_full_direction(direction, base)):
         return _motion(common, base, direction, rotate)
     if rotate is not None:
-        raise ParameterError(f"'{name}' cannot be rotated: only vertex_positions and to_world can")
+        raise ParameterError(f"'{name}' cannot be rotated: only vertex_positions, control_points and to_world can")
     if info.shape in ((4, 4), (3, 3)):
         raise ParameterError(f"'{name}' is a transform: give direction=(dx, dy, dz) or rotate=(ax, ay, az)")
     return _addition(common, base, direction, index)
@@ -160,11 +162,20 @@ def _motion(common: dict, base: Any, direction: Any, rotate: Any) -> Perturbatio
             return t @ base
         if isinstance(base, mi.Point3f):
             return t @ base
+        if name.endswith(CONTROL_POINTS):
+            return _moved_curve(t, base)
         return dr.ravel(t @ dr.unravel(mi.Point3f, base))
 
     label = f"translation along ({words})" if rotate is None else f"rotation about ({words}), per radian"
     return Perturbation(**common, curve=curve, label=label, rotation=rotate is not None, extent=extent,
                         scale=length, centre=centre)
+
+
+def _moved_curve(t: Any, base: Any) -> Any:
+    """Control points, flat, under a rigid motion: their radii stay."""
+    p = dr.unravel(mi.Point4f, base)
+    x = t @ mi.Point3f(p.x, p.y, p.z)
+    return dr.ravel(mi.Point4f(x.x, x.y, x.z, p.w))
 
 
 def _pivot(common: dict, base: Any) -> tuple[tuple[float, ...], float]:
@@ -179,7 +190,8 @@ def _pivot(common: dict, base: Any) -> tuple[tuple[float, ...], float]:
         return tuple(float(c) for c in origin), 0.0
     if isinstance(base, mi.Point3f):
         return tuple(float(c) for c in np.array(base).ravel()), 0.0
-    points = np.array(base, dtype=np.float64).reshape(-1, 3)
+    stride = 4 if common["info"].name.endswith(CONTROL_POINTS) else 3
+    points = np.array(base, dtype=np.float64).reshape(-1, stride)[:, :3]
     lo, hi = points.min(0), points.max(0)
     return tuple(float(c) for c in (lo + hi) / 2), float(np.linalg.norm(hi - lo))
 
@@ -200,7 +212,7 @@ def _addition(common: dict, base: Any, direction: Any, index: int | None) -> Per
             raise ParameterError(f"the direction of '{name}' must have 1 or {size} numbers, got {flat.size}")
         flat = np.broadcast_to(flat, (size,))
     step = _like(base, flat)
-    if name.endswith("vertex_positions"):   # a deformation: its step is a length
+    if name.endswith(("vertex_positions", CONTROL_POINTS)):   # a deformation: its step is a length
         extent, scale = _pivot(common, base)[1], float(np.max(np.abs(flat)))
     else:
         extent, scale = 0.0, float(np.max(np.abs(np.array(base))))

@@ -21,7 +21,7 @@ from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
-from ..plan.job import Job
+from ..plan.job import Job, tubes_of_call
 from ..plan.motion import SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan
 from ..plan.probe_motion import probe_motion
@@ -73,7 +73,8 @@ class _Question:
 
     def job(self, plan: Plan, spp: int) -> Job:
         """The job of a term that gets `spp` paths per pixel."""
-        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor), self.shared, spp)
+        tubes = tubes_of_call(self.call, self.facts, self.shared)
+        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp)
 
 
 def prepare(call: Call) -> Prepared:
@@ -205,7 +206,7 @@ def _pilot(q: _Question, plan: Plan, forms: tuple[str, ...], names: list[str], e
     """The pilot of this epoch; run unless an integrator with the same memory has done so."""
     found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
-        motion = probe_motion(q.call.scene, q.facts)
+        motion = probe_motion(q.call.scene, q.facts, tubes_of_call(q.call, q.facts, q.shared))
 
         def job_of(form: str, seed: int, spp: int) -> Job:
             call = replace(q.call, seed=seed, counters=Counters())

@@ -15,6 +15,7 @@ from ..core.varying import varying
 from ..plan.job import Job
 from ..scene.facts import EmitterFacts, ShapeFacts
 from .convexity import is_convex_body
+from .edge_shapes import edge_shapes
 from .overlaps import apart
 from .rows import EdgeRows
 
@@ -30,14 +31,14 @@ def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> mi.Bool | None
     found = None
     for body in bodies:
         if _may_hide(job, body):
-            inside = _is_inside(job.scene.shapes()[body.index], body, rows, job.facts.reach)
+            inside = _is_inside(edge_shapes(job).shapes[body.index], body, rows, job.facts.reach)
             found = inside if found is None else found | inside
     return found
 
 
 def _may_hide(job: Job, body: ShapeFacts) -> bool:
     """Is this a body that no path gets into?"""
-    shape = job.scene.shapes()[body.index]
+    shape = edge_shapes(job).shapes[body.index]
     small = body.plugin == "sphere" or (body.is_mesh and body.faces <= MAX_FACES)
     if not body.opaque or body.is_emitter or body.has_medium or not small:
         return False
@@ -51,7 +52,7 @@ def _place(job: Job, index: int, facts: EmitterFacts) -> tuple:
     box = job.scene.emitters()[index].bbox()
     if facts.shape >= 0:
         owner = job.facts.shapes[facts.shape].index
-        box = job.scene.shapes()[owner].bbox() if owner >= 0 else job.scene.bbox()
+        box = edge_shapes(job).shapes[owner].bbox() if owner >= 0 else job.scene.bbox()
     return box.min, box.max
 
 

@@ -135,3 +135,20 @@ def curve_cover(
     a, b = (look_at(frame, end, mi.Point2f(LENS_CENTRE)).p for end in ends)
     length = dr.select(known, dr.norm(b - a), dr.norm(patch.upper - patch.lower))
     return patch.cover(frame, border, length, patch.reach)
+
+
+def outline_cover(frame: SensorFrame, border: int, x: list[mi.Point3f]) -> mi.Float:
+    """Relative sampling weight of a piece of a contour [px], of which the points `x` are the start, the middle and the
+    end as seen from the centre of the lens; detached.
+    """
+    lens = mi.Point2f(LENS_CENTRE)
+    a, middle, b = (look_at(frame, point, lens) for point in x)
+    valid = a.valid | middle.valid | b.valid
+    # A piece is an arc, not its chord: leave room for the sagitta.
+    chord = dr.norm(b.p - middle.p) + dr.norm(middle.p - a.p)
+    margin = chord + 1 + lens_reach(frame, (frame.to_local @ x[1]).z)
+    film = dr.norm(mi.Vector2f(frame.crop_size))
+    length = dr.clip(chord, LEAST_LENGTH, film)
+    whole = a.valid & middle.valid & b.valid
+    overlaps = overlaps_film(frame, a.p, b.p, margin, border)
+    return dr.select(valid, dr.select(~whole | overlaps, length, 0), 0)

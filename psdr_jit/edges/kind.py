@@ -214,6 +214,10 @@ class ContourKind(EdgeKind):
     def inside(self, row: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         """A point inside the surface: what a light is asked to shine at before the outline is known."""
 
+    def shades(self, row: mi.UInt32, on: OnEdge, ω: mi.Vector3f, active: mi.Bool) -> mi.Bool | bool:
+        """Do rays along ω, towards a light, notice the surface there? Mitsuba shows some surfaces from outside only."""
+        return True
+
     def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
         """The direction first: parallel lines touch a surface along one contour."""
         ω = mi.warp.square_to_uniform_sphere(u)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame, look_at, viewpoint
+from ..core.sensor_frame import SensorFrame, viewpoint
 from .curves import (
     PIECES,
     CurveRows,
@@ -22,7 +22,7 @@ from .curves import (
     transform_point,
     transform_vector,
 )
-from .film_cover import LEAST_LENGTH, LENS_CENTRE, lens_reach, overlaps_film
+from .film_cover import LENS_CENTRE, outline_cover
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
@@ -49,19 +49,9 @@ class AnalyticCurves(ContourKind):
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         row = dr.arange(mi.UInt32, self.count)
-        lens = mi.Point2f(LENS_CENTRE)
-        eye = viewpoint(frame, lens)
+        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
         on = [self.on(row, mi.Float(t), eye, mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
-        a, middle, b = (look_at(frame, point.x, lens) for point in on)
-        valid = a.valid | middle.valid | b.valid
-        # A piece is an arc, not its chord: leave room for the sagitta.
-        chord = dr.norm(b.p - middle.p) + dr.norm(middle.p - a.p)
-        margin = chord + 1 + lens_reach(frame, (frame.to_local @ on[1].x).z)
-        film = dr.norm(mi.Vector2f(frame.crop_size))
-        length = dr.clip(chord, LEAST_LENGTH, film)
-        whole = a.valid & middle.valid & b.valid
-        overlaps = overlaps_film(frame, a.p, b.p, margin, border)
-        return dr.select(valid, dr.select(~whole | overlaps, length, 0), 0)
+        return outline_cover(frame, border, [point.x for point in on])
 
     def line_weights(self, use: Use) -> mi.Float:
         return curve_lengths(self.curves) * dr.pi

@@ -21,6 +21,7 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
 from ..scene.patterns import StepFamily, pattern_textures, step_families, steps_between_faces, texture_values
+from .edge_shapes import edge_shapes
 from .kind import EdgeKind
 from .kind_pattern import AnalyticPatterns, MeshPatterns
 from .overlaps import apart
@@ -67,7 +68,7 @@ def pattern_kinds(
     for chosen, are_meshes in ((meshes, True), (analytic, False)):
         if not any(facts.patterns for facts in chosen):
             continue
-        shapes, found = [job.scene.shapes()[facts.index] for facts in chosen], patterns_of(job, chosen)
+        shapes, found = [edge_shapes(job).shapes[facts.index] for facts in chosen], patterns_of(job, chosen)
         lines = _lines(job.call.memory, found, shapes, are_meshes)
         if lines is None:
             continue
@@ -87,7 +88,7 @@ def pattern_kinds(
 
 
 def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
-    shape, known = job.scene.shapes()[facts.index], job.call.memory[PATTERNS].get(facts.name)
+    shape, known = edge_shapes(job).shapes[facts.index], job.call.memory[PATTERNS].get(facts.name)
     if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
         return known.patterns
     textures = pattern_textures(shape)
@@ -106,8 +107,13 @@ def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
 
 def _unchanged(known: _Known, values: list, buffers: list) -> bool:
     """A rectangle that moves gets new buffers of the same content."""
-    same = [_identity(v) for v in known.values] == [_identity(v) for v in values]
+    same = same_parameters(known.values, values)
     return same and all(same_values(a, b) for a, b in zip(known.buffers, buffers, strict=True))
+
+
+def same_parameters(known: list, values: list) -> bool:
+    """Are textures and what was found in them the same objects and arrays? The `known` ones must be alive."""
+    return [_identity(v) for v in known] == [_identity(v) for v in values]
 
 
 def _identity(value: Any) -> Any:
@@ -165,7 +171,7 @@ def _seen_sides(
     lower, upper = origin_box(job.frame)
     fronts, shells, firsts, first = [], [], [], 0
     for facts, patterns in zip(chosen, found, strict=True):
-        shape = job.scene.shapes()[facts.index]
+        shape = edge_shapes(job).shapes[facts.index]
         outside = float(facts.opaque and apart(lower, upper, shape.bbox()))
         one_sided = facts.is_mesh and not facts.smooth and not facts.bsdf_flags & int(mi.BSDFFlags.BackSide)
         fronts.append(patterns.front if one_sided and patterns is not None else 0.0)

@@ -22,12 +22,14 @@ from ..scene.facts import ShapeFacts
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .curves import CURVES_OF, PIECES, curve_set
+from .edge_shapes import edge_shapes
 from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
 from .kind_shading import ShadingOutlines
+from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
@@ -51,9 +53,8 @@ def scene_edges(job: Job) -> EdgeTable:
 
 def edge_table(job: Job) -> EdgeTable:
     """All edges of the scene, those that no path can reach left out."""
-    shapes = job.scene.shapes()
-    chosen = [s for s in job.facts.shapes if s.index >= 0]
-    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if not s.is_mesh]
+    shapes, chosen = edge_shapes(job).shapes, edge_shapes(job).facts
+    meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if s.plugin in CURVES_OF]
     pairs = crossing([box_of(shapes[s.index]) for s in chosen])
     warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
     overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
@@ -63,6 +64,8 @@ def edge_table(job: Job) -> EdgeTable:
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
+    if job.tubes is not None:
+        kinds.append(TubeOutlines(job.tubes, tube_rows(job.tubes), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)
@@ -70,7 +73,7 @@ def edge_table(job: Job) -> EdgeTable:
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
     """Edges of the meshes; kept from call to call while every shape rests."""
-    shapes = [job.scene.shapes()[s.index] for s in meshes]
+    shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     seams = [None if p is None else p.on_sides for p in patterns_of(job, meshes)]
     if job.facts.shapes_move or balls or not job.plan.prunes:
         return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls, seams)
@@ -126,7 +129,7 @@ def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
     lower, upper = origin_box(job.frame)
     flags = []
     for facts in meshes:
-        flags.append(float(facts.opaque and apart(lower, upper, job.scene.shapes()[facts.index].bbox())))
+        flags.append(float(facts.opaque and apart(lower, upper, edge_shapes(job).shapes[facts.index].bbox())))
     return mi.Float(flags)
 
 
@@ -152,7 +155,7 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
     """Where interpolated normals turn away, on the meshes that are shaded with them."""
     if not any(s.smooth for s in meshes):
         return []
-    shapes = [job.scene.shapes()[s.index] for s in meshes]
+    shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
     if faces is None:
         return []
@@ -163,7 +166,7 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
 
 def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:
     """Outlines and rims of the shapes without triangles."""
-    shapes = job.scene.shapes()
+    shapes = edge_shapes(job).shapes
     curves = curve_set([(shapes[s.index], s.plugin) for s in analytic])
     if curves.rows is None:
         return None

@@ -1,4 +1,4 @@
-"""Shapes as triangles, to ask whether two of them cut into each other at all. NumPy on the host, detached."""
+"""Shapes as triangles, to ask whether two of them cut into each other at all. On the host, detached."""
 
 from __future__ import annotations
 
@@ -6,11 +6,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import mesh_faces, mesh_positions
+from ..core.compat import CONTROL_POINTS, mesh_faces, mesh_positions
+from ..core.tube_axis import Axis
+from ..scene.capabilities import CURVE_SHAPES
 from .intersections import cross, tolerance
 
 #: Corners of a tessellated circle; rings of a sphere are half as many.
 CORNERS = 96
+
+#: Corners of a circle of a tube, and circles of one segment.
+TUBE_CORNERS, TUBE_RINGS = 24, 6
 
 #: By how much the corners of a polygon are moved outwards, so that it lies around its circle.
 AROUND = 1 / np.cos(np.pi / CORNERS)
@@ -35,6 +40,8 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
     """(F, 3, 3) in world space; radii of circles grow by the factor `outward`."""
     if shape.is_mesh():
         return np.array(dr.detach(mesh_positions(shape)), float).T[np.array(mesh_faces(shape)).T]
+    if plugin in CURVE_SHAPES:
+        return _quads(_tube(shape, outward))
     to_world = np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
     turn = 2 * np.pi * np.arange(CORNERS + 1) / CORNERS
     circle = outward * np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
@@ -46,5 +53,26 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
         polar = np.linspace(0, np.pi, CORNERS // 2 + 1)
         rings = [np.sin(θ) * circle + [0, 0, outward * np.cos(θ)] for θ in polar]
     rings = np.stack(rings) @ to_world[:3, :3].T + to_world[:3, 3]
-    a, b, c, d = rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1]
-    return np.concatenate([np.stack([a, b, c], 2).reshape(-1, 3, 3), np.stack([a, c, d], 2).reshape(-1, 3, 3)])
+    return _quads(rings)
+
+
+def _tube(shape: mi.Shape, outward: float) -> np.ndarray:
+    """Circles about the axis of every segment of a curve: (rings, segments, corners + 1, 3)."""
+    params = mi.traverse(shape)
+    flat, first = dr.detach(params[CONTROL_POINTS]), mi.UInt32(params["segment_indices"])
+    points = [dr.gather(mi.Vector4f, flat, first + k) for k in range(4)]
+    rings = []
+    for v in np.linspace(0, 1, TUBE_RINGS + 1):
+        axis = Axis.of(points, mi.Float(v))
+        a, b, _ = axis.circle(mi.coordinate_system(dr.normalize(axis.dc))[0])
+        c, a, b, r = (np.array(value, float).T[..., None] for value in (axis.c, a, b, axis.r))
+        turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
+        ring = c + outward * r[:, None] * (a * np.cos(turn) + b * np.sin(turn))  # segments, 3, corners
+        rings.append(ring.swapaxes(1, 2))
+    return np.stack(rings)
+
+
+def _quads(rings: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) between neighbours of rings (R, ..., corners, 3)."""
+    a, b, c, d = rings[:-1, ..., :-1, :], rings[:-1, ..., 1:, :], rings[1:, ..., 1:, :], rings[1:, ..., :-1, :]
+    return np.concatenate([np.stack([a, b, c], -2).reshape(-1, 3, 3), np.stack([a, c, d], -2).reshape(-1, 3, 3)])

@@ -31,6 +31,7 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..paths.recording import GRAZING
 from ..plan.motion import Displacements
+from ..scene.tubes import Tubes
 
 
 @dataclass
@@ -50,6 +51,7 @@ class SceneTraits:
     delta_emitters: bool
     delta_lobes: bool  # only together with static geometry, see `scene.checks`
     smooth_lights: bool  # smooth-shaded area lights, see `next_event`
+    tubes: Tubes | None = None  # curves
 
 
 class Flow(ABC):
@@ -72,8 +74,7 @@ def material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements,
     direction stays as it is.
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
-    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    moves.follow(si, hit)
+    si = moves.material(hit, ray, active)
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
+from ..paths.tube_surface import surface_at
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, throughput_ratio
 
@@ -25,7 +26,7 @@ class RestingFlow(Flow):
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
     ) -> VertexTerms:
-        si = vertex.hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All)
+        si = surface_at(self.traits.tubes, vertex.hit.intersection(), ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         emits = vertex.weight_emission > 0
         L = dr.select(emits, vertex.weight_emission * si.emitter(self.scene).eval(si, emits), 0)

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Continuation
+from ..scene.tubes import Tubes
 from .scattering import Scattering, accepted, mixture_pdf, sample_scattering
 
 #: Largest probability with which the roulette lets a path live, as in Mitsuba's `path`.
@@ -32,6 +33,7 @@ class PathLimits:
     uniform_share: float = 0.0  # of the directions, see `scattering`
     refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
+    tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
 
     def beyond(self, k: mi.UInt32) -> PathLimits:
         """Limits of paths that have `k` segments behind them already, lane by lane."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from ..core.surface_code import top_level
 from .bounce import PathLimits, PathState, bounce
 from .rays import first_hit, interaction
 
@@ -18,13 +19,13 @@ from .rays import first_hit, interaction
 def touches(
     scene: mi.Scene, sampler, ray: mi.Ray3f, limits: PathLimits, hide_emitters: bool, table: mi.UInt32
 ) -> mi.Bool:
-    """Does the path scatter at a shape whose entry in `table` (by registry index) is not 0? Detached.
+    """Does the path scatter at a shape, or an instance, whose entry in `table` (by registry index) is not 0? Detached.
 
     The last vertex only emits, and emitters are not in question here, so its ray is never traced.
     """
 
     def stop(pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        return dr.gather(mi.UInt32, table, dr.reinterpret_array(mi.UInt32, pi.shape), active) != 0
+        return dr.gather(mi.UInt32, table, top_level(pi), active) != 0
 
     found, _ = _follow(scene, sampler, ray, limits, hide_emitters, stop)
     return found
@@ -53,7 +54,7 @@ def _follow(
     active = pi.is_valid() & (path.k + 1 < limits.max_depth)
     while dr.hint(active, label="psdr.dry_walk", exclude=[limits]):
         stopped |= stop(pi, active)
-        si = interaction(pi, ray, limits.own_frames)
+        si = interaction(pi, ray, limits)
         sampler.next_2d()  # spent on emitter sampling in `walk`
         onward = bounce(si, si.bsdf(), sampler, path, limits, ctx, active)
         path = onward.path

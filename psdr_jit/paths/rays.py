@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
+from .bounce import PathLimits
+from .tube_surface import surface_at
 
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
@@ -55,15 +57,15 @@ def first_hit(scene: mi.Scene, ray: mi.Ray3f, hide_emitters: bool):
     return ray, pi, mi.Bool(False)
 
 
-def interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, own_frames: bool) -> mi.SurfaceInteraction3f:
-    """The surface that `ray` meets. Unless `own_frames`, its shading frame depends on the normal alone.
+def interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, limits: PathLimits) -> mi.SurfaceInteraction3f:
+    """The surface that `ray` meets. Unless `limits.own_frames`, its shading frame depends on the normal alone.
 
     Mitsuba takes the tangents of a mesh without texture coordinates from the first side of each triangle: with equal
     random numbers, a path would go on in another direction from the next triangle of the same plane, and the difference
     of radiance across their edge, which is nearly 0, would be noise.
     """
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-    if own_frames:
+    si = surface_at(limits.tubes, pi, ray, mi.RayFlags.All)
+    if limits.own_frames:
         return si
     si.sh_frame = mi.Frame3f(si.sh_frame.n)
     si.wi = dr.select(si.is_valid(), si.to_local(-ray.d), si.wi)

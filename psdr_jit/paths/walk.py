@@ -101,7 +101,7 @@ def walk(
 
     # a frozen dataclass cannot be loop state
     while dr.hint(active, label="psdr.walk", exclude=[limits]):
-        si = interaction(pi, ray, limits.own_frames)
+        si = interaction(pi, ray, limits)
         met = _emission(scene, si, last, emission)
         L += path.β * (met.mis * met.value)
         sink.radiance(path.k, L, active)

@@ -12,12 +12,16 @@ from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..options import Options
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
+from ..scene.tubes import Tubes, tubes_of
 from .call import Call
 from .motion import Motion, SceneMotion
 from .plan import Plan
 
 #: Of one render call: the geometry of its sensor.
 FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
+
+#: Of one render call: the curves of its scene, in a tuple once they have been looked for.
+TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,21 @@ class Job:
         return self.shared[FRAME]
 
     @property
+    def tubes(self) -> Tubes | None:
+        """The curves of the scene, read once per render call."""
+        return tubes_of_call(self.call, self.facts, self.shared)
+
+    @property
     def limits(self) -> PathLimits:
         own_frames = any(shape.sees_frame for shape in self.facts.shapes)
-        return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames)
+        return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames, tubes=self.tubes)
+
+
+def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
+    """The curves of the scene, read once per render call."""
+    if shared[TUBES] is None:
+        shared[TUBES] = (tubes_of(call.scene, facts),)
+    return shared[TUBES][0]
 
 
 def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:

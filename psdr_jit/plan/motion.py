@@ -18,6 +18,8 @@ import mitsuba as mi
 
 from ..core.ad import tangents
 from ..core.records import Hit
+from ..paths.tube_surface import surface_at
+from ..scene.tubes import Tubes
 
 
 class Displacements(ABC):
@@ -54,8 +56,8 @@ class Displacements(ABC):
         """The surface met by the attached `ray`, whose intersection is `hit`: `compute_surface_interaction`."""
 
     @abstractmethod
-    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
-        """Let a material point `si` (from `RayFlags.FollowShape`) move, in place."""
+    def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """The same material point with all that is known of it; `ray` is that of `hit`."""
 
     @abstractmethod
     def of_lights(self) -> mi.Vector3f:
@@ -79,12 +81,13 @@ class SceneMotion(Motion):
     """The motion that the enabled parameters of the scene stand for."""
 
     sensor: mi.Sensor
+    tubes: Tubes | None = None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
         with dr.resume_grad():
             dr.enable_grad(*variables)
-            yield SceneDisplacements(self.sensor)
+            yield SceneDisplacements(self.sensor, self.tubes)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         with dr.resume_grad():
@@ -101,10 +104,11 @@ class SceneDisplacements(Displacements):
     """Read off Mitsuba's own attached geometry."""
 
     sensor: mi.Sensor
+    tubes: Tubes | None
 
     def of_surface(self, hit: Hit) -> mi.Vector3f:
         there = hit.shape != 0
-        x = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), _follow(), there).p
+        x = surface_at(self.tubes, hit.intersection(), mi.Ray3f(hit.o, hit.d), _follow(), there).p
         return dr.select(there, moved(x), 0)
 
     def of_edge(self, table, location, ω: mi.Vector3f) -> mi.Vector3f:
@@ -127,13 +131,13 @@ class SceneDisplacements(Displacements):
     def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:
         pi = hit.intersection()
         ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
-        return pi.compute_surface_interaction(ray, _follow(), pi.is_valid()).p
+        return surface_at(self.tubes, pi, ray, _follow(), pi.is_valid()).p
 
     def surface(self, hit: Hit, ray: mi.Ray3f, flags) -> mi.SurfaceInteraction3f:
-        return hit.intersection().compute_surface_interaction(ray, flags)
+        return surface_at(self.tubes, hit.intersection(), ray, flags)
 
-    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
-        """Nothing to do: `RayFlags.FollowShape` has attached it."""
+    def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        return surface_at(self.tubes, hit.intersection(), ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
 
     def of_lights(self) -> mi.Vector3f:
         return mi.Vector3f(0)

@@ -15,7 +15,10 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
+from ..paths.tube_surface import surface_at
 from ..scene.facts import SceneFacts
+from ..scene.instances import is_instance
+from ..scene.tubes import Tubes
 from .motion import Displacements, Motion
 
 #: Direction of the shift and axis of the turn: none that a scene is likely to be aligned with, nor with each other.
@@ -27,11 +30,13 @@ class ProbeMotion(Motion):
     """v(x) = shift + turn × (x − centre), and who takes part. Detached."""
 
     moving: mi.UInt32  # by registry index of a shape: 1 if it can move
+    known: mi.UInt32  # number of its entries: what instances show, and copies of it for edges, rest
     camera: bool
     lights: bool  # those without a shape
     centre: mi.Point3f
     shift: mi.Vector3f
     turn: mi.Vector3f  # as fast at the rim of what moves as the shift
+    tubes: Tubes | None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
@@ -49,8 +54,8 @@ class ProbeMotion(Motion):
         return self.shift + dr.cross(self.turn, o - self.centre), dr.cross(self.turn, d)
 
     def takes_part(self, shape: mi.UInt32) -> mi.Bool:
-        """By registry index; 0, no shape, does not."""
-        return dr.gather(mi.UInt32, self.moving, shape, shape != 0) != 0
+        """By the code of a surface; 0, no shape, does not."""
+        return dr.gather(mi.UInt32, self.moving, shape, (shape != 0) & (shape < self.known)) != 0
 
 
 @dataclass(frozen=True)
@@ -96,14 +101,17 @@ class ProbeDisplacements(Displacements):
         ray = mi.Ray3f(ray)
         ray.o = ray.o - self._of_point(hit.o, moving)
         ray.d = ray.d - dr.cross(w, hit.d)
-        si = pi.compute_surface_interaction(ray, flags)
+        si = surface_at(self.probe.tubes, pi, ray, flags)
         si.p = si.p + self._of_point(si.p, moving)
         si.n, si.sh_frame = _turned(si, w)
         return si
 
-    def follow(self, si: mi.SurfaceInteraction3f, hit: Hit) -> None:
+    def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        follow = mi.RayFlags.All | mi.RayFlags.FollowShape
+        si = surface_at(self.probe.tubes, hit.intersection(), ray, follow, active)
         si.p = si.p + self._of_point(si.p, self.probe.takes_part(hit.shape))
         si.n, si.sh_frame = _turned(si, self._turn_of(hit.shape))
+        return si
 
     def of_lights(self) -> mi.Vector3f:
         return self.v if self.probe.lights else mi.Vector3f(0)
@@ -115,7 +123,7 @@ def _turned(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> tuple[mi.Normal3f, m
     return mi.Normal3f(si.n + dr.cross(w, dr.detach(si.n))), frame
 
 
-def probe_motion(scene: mi.Scene, facts: SceneFacts) -> ProbeMotion:
+def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None) -> ProbeMotion:
     """The probe of a scene, about the middle of what moves."""
     moving = {shape.index for shape in facts.shapes if shape.moves and shape.index >= 0}
     box = mi.ScalarBoundingBox3f()
@@ -123,20 +131,25 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts) -> ProbeMotion:
         box.expand(scene.shapes()[index].bbox())
     sphere = (box if box.valid() else scene.bbox()).bounding_sphere()
     turn = [a / max(float(sphere.radius), 1e-6) for a in AXIS]
+    table = registry_table(scene, moving)
     return ProbeMotion(
-        registry_table(scene, moving),
+        table,
+        varying(mi.UInt32, dr.width(table)),
         facts.camera_moves,
         facts.emitters_move,
         varying(mi.Point3f, list(sphere.center)),
         varying(mi.Vector3f, list(SHIFT)),
         varying(mi.Vector3f, turn),
+        tubes,
     )
 
 
 def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
-    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`."""
+    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`; −1: every instance."""
     ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
     table = [0] * (max(ids, default=0) + 1)
+    if -1 in chosen:
+        chosen = chosen | {k for k, shape in enumerate(scene.shapes()) if is_instance(shape)}
     for index in chosen:
         if index >= 0:
             table[ids[index]] = 1

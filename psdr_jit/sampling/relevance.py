@@ -11,7 +11,6 @@ what moves; if the camera moves, or a light in the direct term, every edge moves
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,8 +23,7 @@ from ..edges.table import EdgeTable
 from ..edges.wedges import Wedges
 from ..plan.job import Job
 from .directions import Cone, pdf_view, sample_view, towards_sphere
-from .distribution import stratified
-from .rows import ROW_SAMPLER, RowSampler, row_state
+from .rows import ROW_SAMPLER, SampledRows, row_state
 
 #: Share of the samples on edges of resting shapes while only shapes move.
 STATIC_SHARE = 0.25
@@ -52,20 +50,13 @@ class Movers:
 
 
 @dataclass(frozen=True)
-class SecondaryEdges:
+class SecondaryEdges(SampledRows):
     """Edges of the scene, how their rows are drawn, and what a resting edge has to look at."""
 
     table: EdgeTable
     use: Use
-    rows: RowSampler
-    state: Any  # of `rows`
     movers: Movers | None
     resting: mi.Bool  # by row of the table: matters only through what slides; unused without movers
-
-    def sample_rows(self, count: int, jitter: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
-        """`(row, t, pdf)` of `count` stratified samples, pdf times their number."""
-        row, t = self.rows.sample(self.state, stratified(count, jitter))
-        return row, t, self.rows.pdf(self.state, row, t) * varying(mi.Float, count)
 
     def views(self, row: mi.UInt32) -> RowViews:
         """Directions through points of these rows of the table."""
@@ -106,7 +97,7 @@ def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
     if movers is not None:
         joined = [dr.select(moving, mi.UInt32(0), 1) for moving in table.moving()]
         flags = (joined[0] if len(joined) == 1 else dr.concat(joined)) != 0
-    return SecondaryEdges(table, use, rows, state, movers, flags)
+    return SecondaryEdges(table, rows, state, use, movers, flags)
 
 
 def line_weights(job: Job, use: Use) -> list[mi.Float]:

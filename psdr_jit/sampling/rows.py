@@ -11,14 +11,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.memory import Slot
+from ..core.varying import varying
+from ..edges.location import EdgeLocation
 from ..plan.job import Job
-from .distribution import EdgeDistribution, edge_distribution, pmf, sample_edge
+from .distribution import EdgeDistribution, edge_distribution, pmf, sample_edge, stratified
 
 
 class RowSampler(ABC):
@@ -73,6 +76,30 @@ def row_state(job: Job, what: str, weights: Callable[[], list[mi.Float]]) -> Any
     if what not in states:
         states[what] = job.call.memory[ROW_SAMPLER].init(what, weights())
     return states[what]
+
+
+class Table(Protocol):
+    """What is known of sampled rows once they have been sampled: as `EdgeTable`."""
+
+    def moves(self, at: EdgeLocation) -> mi.Bool:
+        """Can the edges at these locations move?"""
+
+    def displacement(self, at: EdgeLocation, ω: mi.Vector3f) -> mi.Vector3f:
+        """Vector of value 0 whose derivative is the velocity of the edges there, seen along ω, attached."""
+
+
+@dataclass(frozen=True)
+class SampledRows:
+    """A table, and how its rows are drawn."""
+
+    table: Table
+    rows: RowSampler
+    state: Any  # of `rows`
+
+    def sample_rows(self, count: int, jitter: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """`(row, t, pdf)` of `count` stratified samples, pdf times their number."""
+        row, t = self.rows.sample(self.state, stratified(count, jitter))
+        return row, t, self.rows.pdf(self.state, row, t) * varying(mi.Float, count)
 
 
 def edge_samples(job: Job, paths: int) -> int:

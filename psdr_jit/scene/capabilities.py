@@ -38,19 +38,22 @@ PLUGIN_NAMES = {
 
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
+CURVE_SHAPES = frozenset({"bsplinecurve"})
+"""Tubes about splines (`scene.tubes`)."""
+
 UNSUPPORTED_SHAPES = {
-    "instance": "load the mesh once per copy instead of instancing it",
-    "shapegroup": "load the mesh once per copy instead of instancing it",
     "sdfgrid": "extract a mesh, for example with marching cubes",
     "ellipsoids": "use meshes",
     "ellipsoidsmesh": "use meshes",
-    "bsplinecurve": "tessellate the curves into a mesh",
     "linearcurve": "tessellate the curves into a mesh",
 }
 """Shapes without an edge set: plugin -> the way out."""
 
 INSTANCING = frozenset({"instance", "shapegroup"})
-"""Refused even if nothing moves: a recorded path vertex does not know which instance it is on."""
+"""Shapes that show others. The edges of what they show are found; that these move is not modelled."""
+
+COPIES = "load the mesh once per copy instead of instancing it"
+"""The way out of what instances cannot do."""
 
 SUPPORTED_SENSORS = frozenset({"perspective", "thinlens", "orthographic"})
 """Sensors whose film position of a scene point is known, so that edges can be projected."""
@@ -79,6 +82,9 @@ POSE_PARAMETERS = frozenset({
 })  # fmt: skip
 """Emitter parameters that move the light; all others scale or shape what it emits."""
 
+CONE_PARAMETERS = frozenset({"cutoff_angle", "beam_width"})
+"""Of a spot: they move the steps of its light, if it has any."""
+
 
 class Row(NamedTuple):
     feature: str
@@ -93,17 +99,19 @@ SUPPORT = (
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
         "faces: warning"),
-    Row("rectangle, disk, sphere, cylinder", "yes", "stretched or sheared spheres and cylinders: error"),
-    Row("SDF grids, ellipsoids, curves", "error", _MOVING + "materials and radiance are fine"),
-    Row("instances", "error", "materials as well: load the mesh once per copy"),
+    Row("rectangle, disk, sphere, cylinder, B-spline curve", "yes",
+        "stretched or sheared spheres and cylinders: error"),
+    Row("SDF grids, ellipsoids, linear curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("instances", "yes",
+        "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
     Row("perspective, thin lens, orthographic sensor", "yes", ""),
     Row("batch sensor", "yes", "its sensors are rendered one by one; they need films with its filter and pixel format"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes", ""),
-    Row("point, spot, directional light", "yes", "a spot without a soft rim: warning"),
-    Row("projector", "warning", _MOVING + "the frame of its picture is a step that is not sampled"),
+    Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
+    Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask, hair", "error",
@@ -122,7 +130,8 @@ SUPPORT = (
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
         "the curve where they meet, also of separate parts of one mesh"),
-    Row("cylinders, disks and spheres that cut into other shapes", "warning", "the pair is named; meshes do instead"),
+    Row("cylinders, disks, spheres and curves that cut into other shapes", "warning",
+        "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
     Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),
 )  # fmt: skip

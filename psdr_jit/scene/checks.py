@@ -14,7 +14,7 @@ from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
-from .capabilities import INSTANCING, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+from .capabilities import CONE_PARAMETERS, COPIES, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
 from .facts import SceneFacts, ShapeFacts
 from .size import loss_by_offsets, overflow
 
@@ -116,10 +116,6 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
         yield Finding(UnsupportedError, "", "the scene has no shapes: there is nothing to scatter light; add one")
     for shape in facts.shapes:
         label = f"shape '{shape.name}' ({shape.plugin})"
-        if shape.plugin in INSTANCING:
-            text = f"{label}: no term knows on which instance a path was; {UNSUPPORTED_SHAPES[shape.plugin]}"
-            yield Finding(UnsupportedError, shape.name, text)
-            continue
         if shape.bad_vertices:
             yield Finding(
                 SceneError, shape.name,
@@ -143,6 +139,19 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} is stretched or sheared, which Mitsuba renders as an unstretched one; scale it "
                 "evenly, or use a mesh",
             )  # fmt: skip
+
+
+def check_instances(facts: SceneFacts) -> Iterator[Finding]:
+    """What is instanced rests: Mitsuba does not turn the normals of an instance that moves."""
+    for shape in facts.shapes:
+        if not shape.moves or (shape.kind != "instance" and not shape.group):
+            continue
+        what = "an instance" if shape.kind == "instance" else f"a shape of shapegroup '{shape.group}'"
+        yield Finding(
+            UnsupportedError, shape.name,
+            f"shape '{shape.name}' ({shape.plugin}) is {what} that moves ({', '.join(shape.geometry)}), which is not "
+            f"modelled: instances take part while something else is differentiated; {COPIES}",
+        )  # fmt: skip
 
 
 def check_specular(facts: SceneFacts) -> Iterator[Finding]:
@@ -218,21 +227,14 @@ def _missing_steps(subject: str, label: str, jumps: tuple[str, ...]) -> Finding:
 
 
 def check_emitter_steps(facts: SceneFacts) -> Iterator[Finding]:
-    """Lights whose emission ends in a step that is not the outline of a shape."""
+    """Lights whose emission ends in a step, or in a slope as good as one, that no edge stands for."""
     for emitter in facts.emitters:
         label = f"emitter '{emitter.name}' ({emitter.plugin})"
-        reshaped = {"cutoff_angle", "beam_width"} & set(emitter.radiance)
-        if emitter.hard_edge and (facts.geometry_moves or reshaped):
+        if emitter.rim == "thin" and (facts.geometry_moves or CONE_PARAMETERS & set(emitter.radiance)):
             yield Finding(
                 UnsupportedWarning, emitter.name,
-                f"{label} has no soft rim: the derivative of the edge of its cone is missing; set "
-                "beam_width below cutoff_angle",
-            )  # fmt: skip
-        if emitter.plugin == "projector" and facts.geometry_moves:
-            yield Finding(
-                UnsupportedWarning, emitter.name,
-                f"{label} ends in a step at the frame of its picture, whose derivative is missing; fade the "
-                "picture to black at its border",
+                f"{label} has a rim so thin that few samples meet it: its part of the derivative is mostly noise; set "
+                "beam_width equal to cutoff_angle, which is a step that is sampled, or well below it",
             )  # fmt: skip
         if emitter.plugin in ("sunsky", "timed_sunsky") and (facts.camera_moves or emitter.pose):
             yield Finding(
@@ -248,6 +250,7 @@ CHECKS = (
     check_media,
     check_sensor,
     check_shapes,
+    check_instances,
     check_delta_weights,
     check_extent,
     check_surface_steps,

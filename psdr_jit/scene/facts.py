@@ -13,12 +13,17 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, POSE_PARAMETERS, UNIFORM_EMITTERS, UNSUPPORTED_SHAPES
+from .capabilities import (
+    ANALYTIC_SHAPES,
+    CURVE_SHAPES,
+    INSTANCING,
+    UNSUPPORTED_SHAPES,
+)
+from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
     blends_delta,
     delta_lobes,
-    is_hard_edged,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
@@ -27,6 +32,7 @@ from .graph import (
     weights_of_delta_lobes,
 )
 from .guard import require_derivatives
+from .instances import require_codes, shape_groups
 from .patterns import missing_patterns
 
 
@@ -36,8 +42,9 @@ class ShapeFacts:
 
     name: str
     index: int  # in scene.shapes(); -1 inside a shape group
+    group: str  # id of the shape group that it is in, "" if it is in none
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic" or "unsupported"
+    kind: str  # "mesh", "analytic", "curve", "instance" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -67,22 +74,6 @@ class ShapeFacts:
     def opaque(self) -> bool:
         """No light passes through the surface."""
         return not self.bsdf_flags & int(mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
-
-
-@dataclass(frozen=True)
-class EmitterFacts:
-    """One light source. The pose of an area light is its shape's geometry and is not repeated here."""
-
-    name: str
-    plugin: str  # as written in XML, for example "area" or "envmap"
-    shape: int  # index in SceneFacts.shapes, -1 if it has none
-    delta: bool  # a point or a direction: reached by emitter sampling only
-    infinite: bool
-    varies: bool  # what is seen of it directly differs from point to point or with the direction
-    hard_edge: bool  # a spot whose cone has no soft rim
-    jumps: tuple[str, ...]  # discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
-    pose: tuple[str, ...]  # enabled parameters that move it
-    radiance: tuple[str, ...]  # all other enabled parameters
 
 
 @dataclass(frozen=True)
@@ -141,6 +132,11 @@ class SceneFacts:
         return any(shape.delta_lobes for shape in self.shapes)
 
     @property
+    def has_light_steps(self) -> bool:
+        """Some light throws steps of its own on the surfaces: a picture, or a cone with a hard rim."""
+        return any(emitter.steps for emitter in self.emitters)
+
+    @property
     def has_infinite_emitters(self) -> bool:
         return any(emitter.infinite for emitter in self.emitters)
 
@@ -179,17 +175,20 @@ def analyse(
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         graph = SceneGraph(scene, sensor, counts)
         scene_shapes = list(scene.shapes())
-        shapes = scene_shapes + [s for s in graph.shapes_in_groups() if s not in scene_shapes]
+        groups = shape_groups(graph.nodes())
+        require_codes([s for s in scene_shapes if plugin_name(s) in INSTANCING], groups)
+        places = [(shape, i, "") for i, shape in enumerate(scene_shapes)]
+        places += [(shape, -1, name) for name, members in groups.items() for shape in members]
+        shapes = [shape for shape, _, _ in places]
         bad_vertices = non_finite_vertices(shapes)
         return SceneFacts(
             variant=mi.variant(),
             polarized=mi.is_polarized,
             shapes=tuple(
-                _shape_facts(graph, shape, i if i < len(scene_shapes) else -1, bad_vertices[i])
-                for i, shape in enumerate(shapes)
+                _shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)
             ),
             emitters=tuple(
-                _emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
+                emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
             ),
             sensor=_sensor_facts(graph, sensor),
             enabled=graph.enabled_names(),
@@ -203,24 +202,30 @@ def _extent(scene: mi.Scene) -> float:
     return math.dist(box.max, box.min) if box.valid() else 0.0
 
 
-def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: int) -> ShapeFacts:
+def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad_vertices: int) -> ShapeFacts:
     others = (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium, mi.Shape)  # what is left are texture attributes
     is_mesh, plugin, bsdf = shape.is_mesh(), plugin_name(shape), shape.bsdf()
     enabled = graph.enabled_of(shape)
     shading = tuple(name for name in enabled if _only_shades(name))
     jumps = jumping_textures(graph, bsdf)
     steps = jumps + jumping_textures(graph, shape.emitter())
-    missing = missing_patterns(steps)
     delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
-    if plugin in UNSUPPORTED_SHAPES:
+    if plugin in INSTANCING:
+        kind = "instance"
+    elif plugin in UNSUPPORTED_SHAPES or (group and plugin in CURVE_SHAPES):
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
         kind = "analytic"
+    elif plugin in CURVE_SHAPES:
+        kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
+    # of the steps on a curve, none are edges
+    missing, jumps = (steps, jumps) if kind == "curve" else (missing_patterns(steps), missing_patterns(jumps))
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,
+        group=group,
         plugin=plugin,
         kind=kind,
         is_mesh=is_mesh,
@@ -238,7 +243,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, bad_vertices: i
         delta_varies=delta_varies,
         blends_delta=blends_delta(graph, bsdf),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
-        jumps=missing_patterns(jumps),
+        jumps=jumps,
         sees_frame=sees_frame(graph, bsdf),
         geometry=tuple(name for name in enabled if name not in shading),
         shading=shading + graph.enabled_below(shape, skip=others),
@@ -250,27 +255,6 @@ def _only_shades(parameter: str) -> bool:
     """Whether a mesh parameter leaves the surface where it is."""
     attribute = parameter.startswith(("vertex_", "face_")) and parameter != VERTEX_POSITIONS
     return attribute or parameter in (VERTEX_NORMALS, VERTEX_TEXCOORDS)
-
-
-def _emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: list) -> EmitterFacts:
-    enabled = graph.enabled_of(emitter)
-    pose = tuple(name for name in enabled if name in POSE_PARAMETERS)
-    flags = emitter.flags()
-    owners = [i for i, shape in enumerate(shapes) if shape.emitter() is emitter]
-    name = graph.name(shapes[owners[0]], owners[0]) if owners else graph.name(emitter, index)
-    jumps = jumping_textures(graph, emitter)
-    return EmitterFacts(
-        name=name,
-        plugin=plugin_name(emitter),
-        shape=owners[0] if owners else -1,
-        delta=bool(flags & int(mi.EmitterFlags.Delta)),
-        infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
-        varies=plugin_name(emitter) not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
-        hard_edge=is_hard_edged(graph, emitter),
-        jumps=missing_patterns(jumps) if owners and plugin_name(emitter) == "area" else jumps,
-        pose=pose,
-        radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
-    )
 
 
 def _sensor_facts(graph: SceneGraph, sensor: mi.Sensor) -> SensorFacts:

@@ -14,12 +14,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_positions
-from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, PLUGIN_NAMES, SMOOTH_PARAMETERS
-from .names import traverse
+from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, SMOOTH_PARAMETERS
+from .names import plugin_name, traverse
 from .params import parameter_value
 
-HARD_EDGE = 1e-3
-"""A spot whose rim is thinner than this fraction of its cone counts as a step: no sampling resolves it."""
+HARD_RIM, THIN_RIM = 1e-6, 1e-3
+"""A spot's rim, relative to its cone: narrower than the first, by rounding alone, it is a step; narrower than the
+second, few samples meet it."""
 
 UNEVEN_SCALE = 1e-4
 """Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
@@ -97,10 +98,8 @@ class SceneGraph:
         known = self._children.get(id(node))
         return child_objects(node) if known is None else known
 
-    def shapes_in_groups(self) -> list[mi.Shape]:
-        """The shapes that are visible through instances only."""
-        groups = [n for n in self._nodes if plugin_name(n) == "shapegroup"]
-        return [n for group in groups for n in self.walk(group) if isinstance(n, mi.Shape) and n is not group]
+    def nodes(self) -> list[mi.Object]:
+        return list(self._nodes)
 
     def name(self, node: mi.Object, index: int) -> str:
         """The id given in the scene file, or the plugin and a number."""
@@ -110,10 +109,11 @@ class SceneGraph:
 
 def child_objects(node: mi.Object) -> list[mi.Object]:
     """The objects that `node` refers to directly, in the order in which it names them."""
-    return [child for _, child in _named_children(node)]
+    return [child for _, child in named_children(node)]
 
 
-def _named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
+def named_children(node: mi.Object) -> list[tuple[str, mi.Object]]:
+    """The objects that `node` refers to directly, with the names that it gives them."""
     callback = _children_callback()()
     node.traverse(callback)
     return callback.found
@@ -143,12 +143,6 @@ def _grad_enabled(value) -> bool:
     return value is not None and not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
 
 
-def plugin_name(node: mi.Object) -> str:
-    """The name that creates this object in a scene file; the C++ class name if it is not known."""
-    known = node.class_name().split("[")[0]  # "BitmapTextureImpl[float32]"
-    return PLUGIN_NAMES.get(known, known)
-
-
 def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
     """The perfectly specular and pass-through lobes of a BSDF, each with the nested plugin it comes from."""
     lobes = {}
@@ -175,7 +169,7 @@ def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tup
             continue
         own = [
             child
-            for name, child in _named_children(node)
+            for name, child in named_children(node)
             if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
         ]
         for child in own:
@@ -236,12 +230,16 @@ def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
     return False
 
 
-def is_hard_edged(graph: SceneGraph, emitter: mi.Emitter) -> bool:
-    """Whether a spot light's intensity drops to zero in a step, at the rim of its cone."""
+def rim_of_cone(graph: SceneGraph, emitter: mi.Emitter) -> str:
+    """How a spot light's intensity drops to zero: "soft", "thin" (few samples meet the slope) or "hard" (in a step).
+
+    "" for other lights, and while a function is being frozen.
+    """
     cutoff, beam = (_host(graph.value(emitter, name)) for name in ("cutoff_angle", "beam_width"))
     if cutoff is None or beam is None:
-        return False
-    return bool(np.any(cutoff - beam <= HARD_EDGE * cutoff))
+        return ""
+    width = np.min(cutoff - beam)
+    return "hard" if width <= HARD_RIM * cutoff.max() else "thin" if width <= THIN_RIM * cutoff.max() else "soft"
 
 
 def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
@@ -249,9 +247,14 @@ def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
     if plugin not in ("sphere", "cylinder"):
         return False
     matrix = _host(graph.value(shape, "to_world").matrix)
-    if matrix is None:
+    return matrix is not None and stretches(matrix.reshape(4, 4), plugin)
+
+
+def stretches(matrix: np.ndarray, plugin: str) -> bool:
+    """Whether this object-to-world map (4, 4) makes an ellipsoid of a sphere, or an ellipse of a cylinder's circle."""
+    if plugin not in ("sphere", "cylinder"):
         return False
-    axes = matrix.reshape(4, 4)[:3, :3]
+    axes = matrix[:3, :3]
     length = np.linalg.norm(axes, axis=0)
     round_axes = length if plugin == "sphere" else length[:2]
     gram = (axes / np.maximum(length, np.finfo(np.float32).tiny)).T @ axes / length.max()

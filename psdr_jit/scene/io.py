@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.errors import OptionError, PsdrError, SceneError, SetupError
+from psdr_jit.scene.curve_ends import pad_curves
 from psdr_jit.scene.guard import require_scene, require_variant
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -66,6 +67,7 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
                          "its root element must be <scene>")
     if not scene.sensors():
         raise SceneError(f"scene file '{path}' has no <sensor>: there is no image to render")
+    pad_curves(scene)
     return scene
 
 

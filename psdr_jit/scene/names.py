@@ -13,10 +13,17 @@ from typing import Any
 
 import mitsuba as mi
 
+from psdr_jit.scene.capabilities import PLUGIN_NAMES
 from psdr_jit.scene.guard import require_variant
 
 ADDRESS = re.compile(r"(object_\d+|_unnamed_\d+)(_\d+)?")
 """What Mitsuba calls objects without an id: `object_94174662291344`."""
+
+
+def plugin_name(node: mi.Object) -> str:
+    """The name that creates this object in a scene file; the C++ class name if it is not known."""
+    known = node.class_name().split("[")[0]  # "BitmapTextureImpl[float32]"
+    return PLUGIN_NAMES.get(known, known)
 
 
 def traverse(scene: Any, spellings: Iterable[str] = ()) -> Any:

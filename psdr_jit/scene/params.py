@@ -13,7 +13,8 @@ import mitsuba as mi
 
 from psdr_jit.core.compat import VERTEX_NORMALS, VERTEX_POSITIONS
 from psdr_jit.errors import ParameterError, SceneError
-from psdr_jit.scene.names import stable_name, traverse
+from psdr_jit.scene.capabilities import COPIES, INSTANCING
+from psdr_jit.scene.names import plugin_name, stable_name, traverse
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def _suggestion(name: str, known: list[str]) -> str:
 
 def _describe(params: Any, name: str) -> ParamInfo:
     value = parameter_value(params, name)
-    reason = _obstacle(name, value)
+    reason = _obstacle(name, value) or _rests(params, name)
     differentiable = not reason
     if differentiable and name.endswith("vertex_normals"):
         reason = "shading normals; Mitsuba recomputes them whenever vertex_positions change"
@@ -172,6 +173,16 @@ def _obstacle(name: str, value: Any) -> str:
     if dr.width(value) == 0 or 0 in dr.shape(value):
         return "it is an empty buffer: this shape does not have it"
     return "" if dr.is_diff_v(value) else f"variant '{mi.variant()}' does not track derivatives"
+
+
+def _rests(params: Any, name: str) -> str:
+    """Why the place of an instance, or of what it shows, is not differentiated; empty if it is something else."""
+    node = params.properties[name][2]
+    if not isinstance(node, mi.Shape) or not name.endswith(("to_world", VERTEX_POSITIONS)):
+        return ""
+    owners = (node, params.hierarchy[node][0])
+    instanced = any(owner is not None and plugin_name(owner) in INSTANCING for owner in owners)
+    return f"what is instanced rests; {COPIES}" if instanced else ""
 
 
 def _kind(params: Any, name: str, value: Any) -> str:

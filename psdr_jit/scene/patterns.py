@@ -45,9 +45,26 @@ def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(jump for jump in jumps if jump.split(" ")[0] not in PATTERN_PLUGINS)
 
 
+def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str, ...]) -> tuple[str, ...]:
+    """Of a projector or a spot: the steps that slide over surfaces as the light moves against them, and are edges.
+
+    `rim`: of `graph.rim_of_cone`; `jumps`: of `graph.jumping_textures`.
+    """
+    own = {"projector": ("its frame",), "spot": ("the rim of its cone",) if rim == "hard" else ()}.get(plugin)
+    if own is None or emitter.sampling_weight() == 0:  # what is never sampled lights nothing
+        return ()
+    missing = missing_patterns(jumps)
+    return (*own, *(jump for jump in jumps if jump not in missing))
+
+
 def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
     """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
-    found, todo = {}, [node for node in (shape.bsdf(), shape.emitter()) if node is not None]
+    return stepping_textures([shape.bsdf(), shape.emitter()])
+
+
+def stepping_textures(owners: list[mi.Object | None]) -> list[mi.Object]:
+    """The textures and bump maps below `owners` that step, each once."""
+    found, todo = {}, [node for node in owners if node is not None]
     while todo:
         node = todo.pop()
         if id(node) not in found and not isinstance(node, mi.Shape):

@@ -34,7 +34,7 @@ def test_scene_files(llvm, tmp_path):
     bad = [row for row in rows if row.word in (WRONG, NOT_FINITE)]
     assert not bad, "\n" + table(bad)
     if FOLDER == OWN:
-        assert {row.word for row in rows if row.scene == "instances.xml"} == {REFUSED}
+        assert REFUSED not in {row.word for row in rows if row.scene == "instances.xml"}
 
 
 def test_what_moves_is_found(llvm):

@@ -84,7 +84,8 @@ def spec(depth: int, **budgets) -> dict:
     [
         ({"type": "conductor"}, "rectangle", "glass.to_world", {"rotate": TURN}, SMALL_TURN),
         pytest.param(DIELECTRIC, "sphere", "glass.to_world", {"direction": SHIFT}, STEP, marks=pytest.mark.slow),
-        pytest.param(DIELECTRIC, "cube", "glass.vertex_positions", {"rotate": TURN}, SMALL_TURN, marks=pytest.mark.slow),
+        pytest.param(DIELECTRIC, "cube", "glass.vertex_positions", {"rotate": TURN}, SMALL_TURN,
+                     marks=pytest.mark.slow),
         pytest.param({"type": "thindielectric"}, "rectangle", "camera.to_world", {"direction": SHIFT}, STEP,
                      marks=pytest.mark.slow),
         pytest.param(PLASTIC, "rectangle", "camera.to_world", {"direction": SHIFT}, STEP, marks=pytest.mark.slow),

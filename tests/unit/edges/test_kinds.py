@@ -17,12 +17,14 @@ from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
 from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
 from psdr_jit.edges.kind_shading import ShadingOutlines
+from psdr_jit.edges.kind_tube import TubeOutlines
 from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
 
 COUNT = 4096
 SHIFT = (0.48, 0.6, 0.64)
+PLACED = ("vertex_positions", "to_world", "control_points")
 PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
@@ -30,6 +32,7 @@ PLACES = {  # kind: a scene that has it, and what moves there
     ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
+    TubeOutlines: ("curve_shadow", ["blocker.control_points"]),
 }
 
 
@@ -122,8 +125,8 @@ def test_everything_shifted_shifts_the_edge(found):
     params, θ = mi.traverse(job.scene), mi.Float(0)
     dr.enable_grad(θ)
     still = ("camera", "light", "lamp")
-    for name in [k for k in params.keys() if k.endswith(("vertex_positions", "to_world")) and not k.startswith(still)]:
-        params[name] = moved(params[name], θ)
+    for name in [k for k in params.keys() if k.endswith(PLACED) and not k.startswith(still)]:
+        params[name] = moved(params[name], θ, 4 if name.endswith("control_points") else 3)
     params.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)
     motion = kind.displacement(row, sight.at, sight.ω, mi.Bool(True))
@@ -135,10 +138,11 @@ def test_everything_shifted_shifts_the_edge(found):
     assert np.abs(np.array(speed) - expected)[moving].max() < 1e-3
 
 
-def moved(value, θ):
+def moved(value, θ, stride):
     if "Transform" in type(value).__name__:
         return mi.Transform4f().translate(mi.Vector3f(SHIFT) * θ) @ dr.detach(value)
-    return dr.ravel(dr.unravel(mi.Point3f, dr.detach(value)) + mi.Vector3f(SHIFT) * θ)
+    point = dr.unravel(mi.Point3f if stride == 3 else mi.Point4f, dr.detach(value))  # a curve's with its radius
+    return dr.ravel(point + type(point)(*SHIFT, *[0] * (stride - 3)) * θ)
 
 
 def test_rays_pass_beside(found):

@@ -115,7 +115,7 @@ def test_records_keep_densities(variant, name):
     lane = dr.arange(mi.UInt32, COUNT)
     v = records.vertex(mi.UInt32(0), records.count > 1)
     following = records.arrival(mi.UInt32(1), records.count > 1)
-    si = interaction(v.hit.intersection(), mi.Ray3f(v.hit.o, v.hit.d), False)
+    si = interaction(v.hit.intersection(), mi.Ray3f(v.hit.o, v.hit.d), rules)
     smooth = v.onward.goes_on() & ~v.onward.delta
     f = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(following.hit.d), smooth)
     expected, chosen = np.array(v.β * f * v.onward.inv_pdf()), np.array(smooth)

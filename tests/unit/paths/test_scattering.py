@@ -83,7 +83,11 @@ def test_refused_directions_do_not_go_on(variant, share):
 
 def test_frames_of_triangles_in_one_plane_agree(variant):
     """Equal random numbers must lead into equal directions on either side of an edge that one does not see."""
-    from psdr_jit.paths.rays import interaction as at
+    from psdr_jit.paths.bounce import PathLimits
+    from psdr_jit.paths.rays import interaction
+
+    def at(pi, ray, own: bool) -> mi.SurfaceInteraction3f:
+        return interaction(pi, ray, PathLimits(2, 5, own_frames=own))
 
     mesh = mi.Mesh("square", 4, 2)
     params = mi.traverse(mesh)

@@ -13,10 +13,11 @@ import pytest
 from psdr_jit.core import compat
 from psdr_jit.edges.segments import warn_about_mesh
 from psdr_jit.edges.topology import build_edge_topology
-from psdr_jit.errors import SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
-from psdr_jit.scene.capabilities import INSTANCING, PLUGIN_NAMES, SUPPORT, UNSUPPORTED_SHAPES, support_table
+from psdr_jit.errors import ParameterError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
+from psdr_jit.scene.capabilities import PLUGIN_NAMES, SUPPORT, UNSUPPORTED_SHAPES, support_table
 from psdr_jit.scene.checks import findings, require_supported
 from psdr_jit.scene.facts import analyse
+from psdr_jit.scene.params import find_param
 
 
 @pytest.fixture(autouse=True)
@@ -292,9 +293,7 @@ def exotic_shapes(folder):
     curve.write_text("0 0 0 0.1\n0 0 1 0.1\n0 1 1 0.1\n1 1 1 0.1\n")  # x y z radius
     one = {"centers": mi.TensorXf([[0, 0, 0]]), "scales": mi.TensorXf([[1, 1, 1]]),
            "quaternions": mi.TensorXf([[0, 0, 0, 1]])}  # fmt: skip
-    group = {"group": {"type": "shapegroup", "inner": BALL}}
     return {
-        "instance": {**group, "x": {"type": "instance", "g": {"type": "ref", "id": "group"}}},
         "sdfgrid": {"x": {"type": "sdfgrid", "grid": mi.TensorXf([-1.0, 1] * 4, (2, 2, 2, 1))}},
         "ellipsoids": {"x": {"type": "ellipsoids", **one}},
         "ellipsoidsmesh": {"x": {"type": "ellipsoidsmesh", **one}},
@@ -303,8 +302,7 @@ def exotic_shapes(folder):
     }
 
 
-@pytest.mark.parametrize("plugin", ["instance", "sdfgrid", "ellipsoids", "ellipsoidsmesh", "bsplinecurve",
-                                    "linearcurve"])  # fmt: skip
+@pytest.mark.parametrize("plugin", ["sdfgrid", "ellipsoids", "ellipsoidsmesh", "linearcurve"])
 def test_shapes_without_edges(plugin, tmp_path):
     objects = exotic_shapes(tmp_path)[plugin]
     for moving in ("floor.to_world", "lamp.position", CAMERA):
@@ -313,14 +311,39 @@ def test_shapes_without_edges(plugin, tmp_path):
         assert (UnsupportedError, "x") in complaints(facts)
         with pytest.raises(UnsupportedError, match=UNSUPPORTED_SHAPES[plugin]):
             require_supported(facts)
-    materials_only = complaints(facts_of(load(**objects), NOTHING_MOVES))
-    assert bool(materials_only) == (plugin in INSTANCING)  # a path does not know on which instance it was
+    assert not complaints(facts_of(load(**objects), NOTHING_MOVES))
 
 
-def test_shape_inside_a_group_moves(tmp_path):
-    facts = facts_of(load(**exotic_shapes(tmp_path)["instance"]), "group.inner.to_world")
-    assert facts.geometry_moves
-    assert (UnsupportedError, "x") in complaints(facts)
+GROUP = {"type": "shapegroup", "inner": BALL}
+INSTANCE = {"group": GROUP, "x": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
+
+
+def test_instances_may_rest_while_something_moves():
+    for moving in ("floor.to_world", "lamp.position", CAMERA, NOTHING_MOVES):
+        facts = facts_of(load(**INSTANCE), moving)
+        assert (named(facts, "x").kind, named(facts, "x").group) == ("instance", "")
+        assert (named(facts, "inner").index, named(facts, "inner").group) == (-1, "group")
+        assert not complaints(facts)
+
+
+@pytest.mark.parametrize(("moving", "name"), [("group.inner.to_world", "inner"), ("x.to_world", "x")])
+def test_what_is_instanced_must_not_move(moving, name):
+    scene = load(**INSTANCE)
+    facts = facts_of(scene, moving)
+    assert complaints(facts) == [(UnsupportedError, name)]
+    with pytest.raises(UnsupportedError, match="load the mesh once per copy"):
+        require_supported(facts)
+    with pytest.raises(ParameterError, match="load the mesh once per copy"):
+        find_param(scene, moving)
+
+
+def test_groups_must_be_told_apart():
+    scene = load(a=GROUP, b=GROUP)
+    for node in mi.traverse(scene).hierarchy:
+        if node.id() in ("a", "b"):
+            node.set_id("twice")
+    with pytest.raises(UnsupportedError, match="give each an id"):
+        facts_of(scene, NOTHING_MOVES)
 
 
 def test_media_are_refused_always():
@@ -400,12 +423,13 @@ def test_non_finite_vertices():
 @pytest.mark.parametrize(
     ("emitter", "moving", "warned"),
     [
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "floor.to_world", True),
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "light.cutoff_angle", True),
-        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "light.intensity.value", False),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, "floor.to_world", False),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "floor.to_world", True),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "light.cutoff_angle", True),
+        ({"type": "spot", "cutoff_angle": 20, "beam_width": 19.99}, "light.intensity.value", False),
         ({"type": "spot", "cutoff_angle": 20, "beam_width": 15}, "light.to_world", False),
-        ({"type": "spot", "texture": {"type": "checkerboard"}}, "light.to_world", True),
-        ({"type": "projector", "irradiance": 1.0}, "light.to_world", True),
+        ({"type": "spot", "texture": {"type": "checkerboard"}}, "light.to_world", False),
+        ({"type": "projector", "irradiance": 1.0}, "light.to_world", False),
         ({"type": "projector", "irradiance": 1.0}, "light.scale", False),
         ({"type": "sunsky"}, CAMERA, True),
         ({"type": "sunsky"}, "floor.to_world", False),
@@ -417,6 +441,21 @@ def test_emitters_with_steps(emitter, moving, warned):
     if warned:
         with pytest.warns(UnsupportedWarning, match="'light'"):
             require_supported(facts)
+
+
+@pytest.mark.parametrize("light, steps, pose", [
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 20}, ("the rim of its cone",), True),
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 15}, (), False),
+    ({"type": "spot", "cutoff_angle": 20, "beam_width": 20, "sampling_weight": 0.0}, (), False),  # lights nothing
+    ({"type": "spot", "texture": {"type": "checkerboard"}}, ("checkerboard",), True),
+    ({"type": "projector", "irradiance": 1.0}, ("its frame",), True),
+    ({"type": "projector", "irradiance": {"type": "checkerboard"}}, ("its frame", "checkerboard"), True),
+])  # fmt: skip
+def test_steps_that_a_light_brings_along(light, steps, pose):
+    """Where it has any, what opens its cone counts as a pose: it moves them."""
+    moving = "light.to_world" if light["type"] == "projector" else "light.cutoff_angle"
+    emitter = named(facts_of(load(light=light), moving), "light")
+    assert tuple(step.split(" '")[0] for step in emitter.steps) == steps and bool(emitter.pose) == pose
 
 
 def test_moving_texture_coordinates_slide_steps():

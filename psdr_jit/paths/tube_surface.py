@@ -1,0 +1,106 @@
+"""The surface that a ray meets, on curves as on everything else: the one place that asks Mitsuba for it.
+
+On a curve (`core.tube_axis`) the material point keeps its v and its place on the circle,
+
+    x(θ) = c + r a,        a the part of its former direction at right angles to c', of unit length
+
+A ray of moving origin and direction meets the surface where it meets the tangent plane of that point, and there
+
+    v̇ = [(ẋ − ċ)·c' + ρ·ċ'] / B
+
+from (x − c(v))·c'(v) = 0. All else, normal, frame and texture coordinates, follows from x and v.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.tube_axis import Axis
+from ..scene.tubes import Tubes
+
+
+def surface_at(
+    tubes: Tubes | None, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags, active: mi.Bool | bool = True
+) -> mi.SurfaceInteraction3f:
+    """`pi.compute_surface_interaction(ray, flags, active)`, attached to the ray and to the shape, curves included.
+
+    With `RayFlags.FollowShape` points stay on their material.
+    """
+    if tubes is None:
+        return pi.compute_surface_interaction(ray, flags, active)
+    segment, on_tube = tubes.segment(pi, active & pi.is_valid())
+    si = pi.compute_surface_interaction(ray, flags, active & ~on_tube)
+    own = _on_tube(tubes, pi, segment, ray, int(flags) & int(mi.RayFlags.FollowShape) != 0, on_tube)
+    # field by field: a whole interaction would be selected with its instance and its differentials
+    for name in ("t", "time", "p", "n", "uv", "sh_frame", "dp_du", "dp_dv", "wi", "prim_index", "shape"):
+        setattr(si, name, dr.select(on_tube, getattr(own, name), getattr(si, name)))
+    si.wavelengths = ray.wavelengths
+    return si
+
+
+def _on_tube(
+    tubes: Tubes,
+    pi: mi.PreliminaryIntersection3f,
+    segment: mi.UInt32,
+    ray: mi.Ray3f,
+    follow: bool,
+    active: mi.Bool,
+) -> mi.SurfaceInteraction3f:
+    """The surface of a curve; lanes that are not `active` hold anything finite."""
+    # lanes elsewhere must not divide by what is no tube
+    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
+    t, v = dr.select(active, pi.t, 0), mi.Float(pi.prim_uv.x)
+    axis = tubes.axis(segment, v, active)
+    x = dr.detach(o) + t * dr.detach(d)
+    if follow:  # whose ray may start a little beside that of the hit
+        x = mi.Point3f(dr.detach(_material(axis, x)))
+    p = mi.Point3f(x)
+    if dr.grad_enabled(o, d, axis):
+        p = mi.Point3f(_material(axis, x) if follow else _on_ray(axis, x, o, d, t))
+        p = dr.replace_grad(x, p)
+        v = dr.replace_grad(v, dr.dot(p - axis.c, axis.dc) / dr.detach(axis.bend(x - axis.c)))
+        axis = tubes.axis(segment, v, active)
+    si = _geometry(axis, p)
+    shape = dr.reinterpret_array(mi.UInt32, pi.shape)
+    si.uv.y = (v + pi.prim_index) / dr.gather(mi.UInt32, tubes.count, shape, active)
+    si.dp_dv *= dr.gather(mi.UInt32, tubes.count, shape, active)
+    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
+    si.time = ray.time
+    si.wi = si.sh_frame.to_local(-d)
+    si.prim_index = pi.prim_index
+    si.shape = pi.shape
+    return si
+
+
+def _material(axis: Axis, x: mi.Point3f) -> mi.Vector3f:
+    """Where the material point goes that is at `x` (detached)."""
+    a, _, _ = axis.circle(dr.detach(x - axis.c))
+    return axis.c + axis.r * a
+
+
+def _on_ray(axis: Axis, x: mi.Point3f, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
+    """Where the attached ray from `o` along `d`, at whose distance `t` the point `x` lies, meets the surface."""
+    n = dr.detach(axis.normal(x - axis.c))
+    return o + d * dr.replace_grad(t, dr.dot(n, _material(axis, x) - o) / dr.dot(n, d))
+
+
+def _geometry(axis: Axis, p: mi.Point3f) -> mi.SurfaceInteraction3f:
+    """Normal, frame, tangents by (u, segment) and u at a point `p` of the circle of `axis`, all attached to both.
+
+    u is measured as Mitsuba does, from the direction nearest to the z axis.
+    """
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    ρ = p - axis.c
+    a, b, _ = axis.circle(ρ)
+    si.p = p
+    si.n = mi.Normal3f(dr.normalize(axis.normal(ρ)))
+    si.sh_frame = mi.Frame3f(b, dr.cross(si.n, b), si.n)
+    along = dr.select(axis.bend(ρ) > 0, axis.bend(ρ), 0) / dr.squared_norm(axis.dc)
+    si.dp_du = dr.two_pi * axis.r * b
+    si.dp_dv = along * axis.dc + axis.dr * a
+    up, _, _ = axis.circle(mi.Vector3f(0, 0, 1))
+    across = dr.cross(up, dr.normalize(axis.dc))
+    u = dr.atan2(dr.dot(up, a), dr.dot(across, a)) * dr.inv_two_pi
+    si.uv = mi.Point2f(dr.select(u < 0, u + 1, u), 0)
+    return si

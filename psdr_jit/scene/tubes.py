@@ -1,0 +1,94 @@
+"""The curves of a scene as tables: which segment a ray has met, and its control points.
+
+Mitsuba's own attached evaluation of curves is not used: its points do not stay on the surface where circles twist, and
+at the very end of a shape it reads past its segments. What is here is enough to evaluate them anew (`core.tube_axis`,
+`paths.tube_surface`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import CONTROL_POINTS
+from ..core.tube_axis import Axis
+from ..core.upload import uploaded
+from .facts import SceneFacts
+
+#: Of a shape that is no curve.
+NONE = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Tubes:
+    """All curves of a scene, one after the other. Host object; the arrays are detached."""
+
+    shapes: tuple[mi.Shape, ...]
+    pointers: mi.ShapePtr  # to them
+    moves: tuple[bool, ...]  # by shape
+    start: mi.UInt32  # by registry index of a shape: its first segment, `NONE` if it is no curve
+    count: mi.UInt32  # likewise: how many segments it has
+    first: mi.UInt32  # by segment: its first control point ...
+    owner: mi.UInt32  # ... and its shape
+    offsets: tuple[int, ...]  # by shape: its first control point
+    points: mi.Float  # (x, y, z, radius) of all control points, flat
+
+    def segment(self, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """Which segment was met, and whether it was one at all."""
+        start = dr.gather(mi.UInt32, self.start, dr.reinterpret_array(mi.UInt32, pi.shape), active)
+        met = active & (start != NONE)
+        return start + pi.prim_index, met
+
+    def pointer(self, segment: mi.UInt32, active: mi.Bool) -> mi.ShapePtr:
+        """The shape of segments."""
+        return dr.gather(mi.ShapePtr, self.pointers, dr.gather(mi.UInt32, self.owner, segment, active), active)
+
+    def prim_index(self, segment: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The number of segments within their shape."""
+        shape = dr.reinterpret_array(mi.UInt32, self.pointer(segment, active))
+        return segment - dr.gather(mi.UInt32, self.start, shape, active)
+
+    def axis(self, segment: mi.UInt32, v: mi.Float, active: mi.Bool) -> Axis:
+        """The axis at v of segments; attached to control points whose gradients are enabled."""
+        first = dr.gather(mi.UInt32, self.first, segment, active)
+        p = [dr.gather(mi.Vector4f, self.points, first + k, active) for k in range(4)]
+        if any(self.moves):
+            owner = dr.gather(mi.UInt32, self.owner, segment, active)
+            for k, (shape, offset) in enumerate(zip(self.shapes, self.offsets, strict=True)):
+                flat = mi.traverse(shape)[CONTROL_POINTS] if self.moves[k] else None
+                if flat is not None and dr.grad_enabled(flat):
+                    mine = active & (owner == k)
+                    # from each shape's own array: a gradient does not leave a loop through a concatenation
+                    own = [dr.gather(mi.Vector4f, flat, first - offset + j, mine) for j in range(4)]
+                    p = [dr.select(mine, a, b) for a, b in zip(own, p, strict=True)]
+        return Axis.of(p, v)
+
+
+def tubes_of(scene: mi.Scene, facts: SceneFacts) -> Tubes | None:
+    """The curves of `scene`; None if there are none."""
+    chosen = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
+    if not chosen:
+        return None
+    shapes = [scene.shapes()[s.index] for s in chosen]
+    ids = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    start, count = (np.full(ids.max() + 1, value, np.uint32) for value in (NONE, 1))
+    first, owner, offsets, points, segments = [], [], [], [], 0
+    for k, (facts_of, shape) in enumerate(zip(chosen, shapes, strict=True)):
+        params = mi.traverse(shape)
+        own = np.array(params["segment_indices"], np.uint32)
+        offsets.append(sum(dr.width(p) for p in points) // 4)
+        points.append(dr.detach(params[CONTROL_POINTS]))
+        first.append(own + offsets[-1])
+        owner.append(np.full(len(own), k))
+        start[ids[facts_of.index]], count[ids[facts_of.index]] = segments, len(own)
+        segments += len(own)
+    flat = points[0] if len(points) == 1 else dr.concat(points)
+    dr.eval(flat)
+    tables = [uploaded(mi.UInt32, np.concatenate(a)) for a in (first, owner)]
+    moves = tuple(s.moves for s in chosen)
+    pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
+    return Tubes(tuple(shapes), pointers, moves, uploaded(mi.UInt32, start), uploaded(mi.UInt32, count), *tables,
+                 tuple(offsets), flat)  # fmt: skip
