@@ -159,7 +159,7 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
     faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
     if faces is None:
         return []
-    if any(not e.delta for e in job.facts.emitters):
+    if job.options.depth_limit > 2 or any(not e.delta for e in job.facts.emitters):  # surfaces are lights as well
         warn_about_coarse(faces, job.call.memory)
     return [ShadingOutlines(faces, centre)]
 

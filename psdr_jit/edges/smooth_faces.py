@@ -88,8 +88,8 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
 def warn_about_coarse(faces: SmoothFaces, memory: Memory) -> None:
     """Name meshes whose shading normals are far off their faces, once each.
 
-    Such a face still reflects light along its own plane. Where that plane passes through a light, as much of the light
-    as sinks below it is lost in a step, which no edge of the mesh stands for.
+    Such a face still reflects light along its own plane. Where that plane passes through a light, or through a surface
+    that sends light, as much of it as sinks below the plane is lost in a step, which no edge of the mesh stands for.
     """
     unknown = [i for i, mesh in enumerate(faces.meshes) if mesh.id() not in memory[LOOKED_AT]]
     if not unknown or dr.flag(dr.JitFlag.FreezingScope):
@@ -108,8 +108,9 @@ def warn_about_coarse(faces: SmoothFaces, memory: Memory) -> None:
         if float(share[0]) > COARSE_SHARE:
             warn_once(
                 f"mesh '{faces.meshes[i].id()}' is shaded with normals that are more than {COARSE:g} degrees off its "
-                "faces: where the plane of a face passes through a light, a step of what it reflects is missing from "
-                "the derivative; split its normals at sharp edges, set face_normals, or use a finer mesh",
+                "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
+                "reflects is missing from the derivative; split its normals at sharp edges, set face_normals, or use "
+                "a finer mesh",
                 UnsupportedWarning,
                 memory,
             )
