@@ -33,7 +33,7 @@ class AtRest(Motion):
         with dr.resume_grad():
             dr.enable_grad(*variables)
         with dr.resume_grad(*variables):
-            yield SceneDisplacements(self.sensor)
+            yield SceneDisplacements(self.sensor, None)  # curves are refused beside delta lobes
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         return mi.Vector3f(0), mi.Vector3f(0)

@@ -114,8 +114,10 @@ SUPPORT = (
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
-    Row("mirrors, smooth glass and plastic, null, mask, hair", "error",
-        _MOVING + "motion transport through specular vertices is missing"),
+    Row("mirrors, smooth glass and plastic, null, mask", "warning",
+        _MOVING + "edges of shadows, reflections and patterns that the sensor sees in them are missing, outlines are "
+        "there; beside instances and curves: error"),
+    Row("hair, specular materials with bent normals or under a mask", "error", _MOVING + "use a rough material"),
     Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
         "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
     Row("blendbsdf of a smooth and a perfectly specular material", "error",
