@@ -117,11 +117,10 @@ SUPPORT = (
     Row("mirrors, smooth glass and plastic, null, mask", "warning",
         _MOVING + "edges of shadows, reflections and patterns that the sensor sees in them are missing, outlines are "
         "there; beside instances and curves: error"),
-    Row("hair, specular materials with bent normals or under a mask", "error", _MOVING + "use a rough material"),
     Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
         "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
-    Row("blendbsdf of a smooth and a perfectly specular material", "error",
-        "Mitsuba does not report its sampling density"),
+    Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
+        "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, face attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
         "a bump map's slopes step at edges; where bent normals turn from the viewer is none: a few % at outlines"),
