@@ -33,6 +33,9 @@ class PathSpaceIntegrator(TermIntegrator):
      * - sppp
        - |int|
        - Samples per pixel of the primary boundary term: edges seen directly by the sensor
+     * - spps
+       - |int|
+       - Lines per pixel of the boundary seen in mirrors and behind glass (Default: as `sppp`)
      * - sppi, sppd
        - |int|
        - Samples per pixel of the secondary boundary terms; `sppd` overrides `sppi` for the direct one

@@ -22,8 +22,8 @@ DIRECTIONS = ("any", "known")
 
 
 #: The options that hold a term's samples per pixel, and which of them follows another one where it is not set.
-BUDGETS = ("sppc", "sppp", "sppi", "sppd")
-FOLLOWS = {"sppd": "sppi"}
+BUDGETS = ("sppc", "sppp", "spps", "sppi", "sppd")
+FOLLOWS = {"sppd": "sppi", "spps": "sppp"}
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Options:
     hide_emitters: bool = False  # directly visible emitters are transparent
     sppc: int | None = None  # samples per pixel, interior (continuous) term
     sppp: int | None = None  # samples per pixel, primary boundary
+    spps: int | None = None  # lines per pixel, boundary seen through mirrors and glass; overrides sppp
     sppi: int | None = None  # samples per pixel, default of each secondary boundary term
     sppd: int | None = None  # samples per pixel, direct boundary term; overrides sppi
     record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes

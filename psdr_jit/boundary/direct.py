@@ -141,7 +141,8 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:
     """What the segments are worth at the sensor: their subpaths are recorded."""
     a = -(1 - segment.ratio) * segment.n_perp
-    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, segment.value / segment.pdf, a)
+    value, still = segment.value / segment.pdf, mi.Vector3f(0)
+    receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, value, a, still)
     records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_from_light(job))
     return BoundarySamples(
         at=segment.at,
@@ -149,7 +150,7 @@ def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> Bound
         n_perp=segment.n_perp,
         wavelengths=segment.wavelengths,
         records=records,
-        value=records.data.W,
+        value=records.left_by_smooth_lobes(records.data.W),
         source_motion=lambda moving: source_motion(job, segment, moving),
     )
 

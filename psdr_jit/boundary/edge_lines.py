@@ -103,15 +103,17 @@ def slots(records: SubpathRecords, kept: mi.UInt32) -> mi.UInt32:
     return slot
 
 
-def radiance_by_depth(job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: int, active: mi.Bool):
-    """Radiance along `ray` without what its first vertex emits, by depth: `(by_depth, of the whole path)`.
+def radiance_by_depth(
+    job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: int, active: mi.Bool, emission: mi.Bool
+):
+    """Radiance along `ray`, by depth: `(by_depth, of the whole path)`.
 
-    `lane`: picks the random numbers.
+    `lane`: picks the random numbers. `emission`: lanes that count what the first vertex emits.
     """
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), lane)
     by_depth = RadianceByDepth(dr.width(lane), vertices)
     limits = replace(job.limits, max_depth=vertices)
-    final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, mi.Bool(False), active)
+    final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, emission, active)
     dr.eval(final, by_depth.values, by_depth.reached)
     return by_depth, final
 
@@ -123,4 +125,5 @@ def longest_path(job: Job) -> int:
 
 def longest_subpath(job: Job) -> int:
     """Vertices from the sensor to the receiver that are recorded, at most."""
-    return recorded_vertices(job, longest_path(job))
+    beyond = 1 if job.facts.has_delta_lobes else 0  # delta lobes see what the other side of the edge emits
+    return recorded_vertices(job, longest_path(job) + beyond)

@@ -38,7 +38,8 @@ NAME = "indirect"
 
 def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples:
     """The step of radiance across every edge, at the sensor."""
-    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.value / view.pdf, -view.sight.n_perp)
+    turn = edges.table.turn(view.sight.at, view.sight.ω, view.sight.n_perp) - view.sight.r * view.sight.n_perp
+    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.value / view.pdf, -view.sight.n_perp, turn)
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, edges.table, view, records))
     dr.eval(value)
@@ -69,6 +70,13 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
     minus, plus = (
         by_depth.up_to(left, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed)) for side in (0, 1)
     )
+    if records.delta is not None:
+        emission = [
+            by_depth.up_to(mi.UInt32(0) + 0 * left, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed))
+            for side in (0, 1)
+        ]
+        smooth = needed & ~records.by_delta_lobe()
+        minus, plus = (dr.select(smooth, L - e, L) for L, e in zip((minus, plus), emission, strict=True))
     return dr.select(needed, minus - plus, 0)
 
 
@@ -77,7 +85,8 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
     ray, pi, differs = look_beside(job.scene, table, v.sight, which, v.wavelengths)
-    return radiance_by_depth(job, ray, pi, v.lane, vertices, differs)
+    emission = mi.Bool(job.facts.has_delta_lobes)  # seen by delta lobes, and taken off again for all others
+    return radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission)
 
 
 #: What its lines are drawn for, by form.

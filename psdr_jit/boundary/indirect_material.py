@@ -58,7 +58,7 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
     # An edge that moves as the line turns does so as x_D and x_S move against each other: ω̇ = (v_S − u_D)/r_S.
     turn = edges.table.turn(v.sight.at, v.sight.ω, v.sight.n_perp) * (b.ratio / v.sight.r)
     a = -(1 - b.ratio) * v.sight.n_perp - turn
-    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a)
+    receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a, mi.Vector3f(0))
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
     dr.eval(value)
@@ -83,9 +83,8 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
     slot = slots(records, kept)
     s = dr.gather(Background, b, kept)
     ray = mi.Ray3f(s.source.o, s.source.d, 0, s.view.wavelengths)
-    by_depth, final = radiance_by_depth(
-        job, ray, s.source.intersection(), s.view.lane, longest_path(job) + 1, mi.Bool(True)
-    )
+    pi, vertices = s.source.intersection(), longest_path(job) + 1
+    by_depth, final = radiance_by_depth(job, ray, pi, s.view.lane, vertices, mi.Bool(True), mi.Bool(False))
     needed = dr.gather(mi.Bool, useful, lane)
     slot = dr.gather(mi.UInt32, slot, lane)
     L = by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed))

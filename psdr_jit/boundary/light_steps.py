@@ -91,7 +91,8 @@ def trace(job: Job, steps: SampledSteps, line: StepLine) -> StepOnReceiver | Non
 
 def evaluate(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySamples:
     """What they are worth at the sensor: their subpaths are recorded."""
-    receivers = Receivers(found.lane, found.receiver, found.wavelengths, found.value / found.pdf, -found.n_perp)
+    value, still = found.value / found.pdf, mi.Vector3f(0)
+    receivers = Receivers(found.lane, found.receiver, found.wavelengths, value, -found.n_perp, still)
     records = subpaths(job, Stream.LIGHT_STEP_SUBPATH, receivers, longest_from_light(job))
     return BoundarySamples(
         at=found.at,
@@ -99,7 +100,7 @@ def evaluate(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySa
         n_perp=found.n_perp,
         wavelengths=found.wavelengths,
         records=records,
-        value=records.data.W,
+        value=records.left_by_smooth_lobes(records.data.W),
         source_motion=lambda moving: mi.Float(0),
     )
 

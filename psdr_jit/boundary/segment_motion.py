@@ -73,7 +73,10 @@ def _motion(job: Job, edges: SampledRows, s: BoundarySamples, moving: Displaceme
     camera = mi.Float(0)
     if job.facts.camera_moves:
         camera = dr.dot(c.camera, moving.of_camera(c.film, c.aperture, c.hit.o + c.hit.d * c.hit.t))
-    return _Motion(at_edge, dr.dot(c.deposit_connect, surface), dr.dot(c.deposit_continue, surface), camera)
+    go_on = dr.dot(c.deposit_continue, surface)
+    if s.records.delta is not None:
+        go_on += s.records.delta.motion(c.hit, moving)
+    return _Motion(at_edge, dr.dot(c.deposit_connect, surface), go_on, camera)
 
 
 def _splat(job: Job, s: BoundarySamples, motion: mi.Float) -> mi.TensorXf:

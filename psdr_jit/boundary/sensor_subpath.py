@@ -35,6 +35,7 @@ from ..paths.rays import SHADOW_EPSILON, skip_emitters
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
+from .delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32
@@ -49,6 +50,7 @@ class Receivers:
     wavelengths: mi.Color0f
     value: mi.Spectrum  # of the boundary segment over its density
     a: mi.Vector3f  # covector on u_D
+    b: mi.Vector3f  # covector on the direction in which x_D is left, which moves if that is by a delta lobe
 
 
 @dataclass
@@ -66,12 +68,16 @@ class Connection:
 
 
 class SubpathRecords:
-    """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state."""
+    """Connections of `lanes` subpaths, at most `depth` each, vertex-major. Not a PyTree, so never loop state.
+
+    `delta`: of a scene with delta lobes, whose turns are recorded as well.
+    """
 
     BYTES_RGB = 4 * (11 + 9 + 6 + 3)  # of one vertex
 
-    def __init__(self, lanes: int, depth: int):
+    def __init__(self, lanes: int, depth: int, delta: bool):
         size = lanes * depth
+        self.delta = DeltaRecords(lanes, depth) if delta else None
         self.lanes, self.depth = lanes, depth
         self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
@@ -89,6 +95,16 @@ class SubpathRecords:
 
     def write(self, k: mi.UInt32, connection: Connection, active: mi.Bool) -> None:
         dr.scatter(self.data, connection, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
+
+    def left_by_smooth_lobes(self, values: mi.Spectrum) -> mi.Spectrum:
+        """`values` (flat) of connections whose path leaves its first vertex by a smooth lobe; 0 for all others."""
+        if self.delta is None:
+            return values
+        return dr.select(self.by_delta_lobe(), 0, values)
+
+    def by_delta_lobe(self) -> mi.Bool:
+        """Connections (flat) whose path leaves its first vertex, and does not end there, by a delta lobe."""
+        return (self.vertex_of() > 0) & dr.gather(mi.Bool, self.delta.leaves, self.lane_of())
 
     def connected(self) -> mi.Bool:
         """Per lane: does any vertex see the sensor?"""
@@ -166,10 +182,12 @@ def _connected(records: SubpathRecords) -> mi.Bool:
 
 def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
     """Walk every receiver x_D back to the sensor, at most `longest` vertices."""
-    records = SubpathRecords(dr.width(receivers.lane), longest)
+    records = SubpathRecords(dr.width(receivers.lane), longest, job.facts.has_delta_lobes)
     limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE)
     walk_to_sensor(job, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
     dr.eval(records.data)
+    if records.delta is not None:
+        dr.eval(records.delta.turns, records.delta.leaves)
     return records
 
 
@@ -222,7 +240,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     ray = mi.Ray3f(receivers.hit.o, receivers.hit.d, 0, receivers.wavelengths)
     pi = receivers.hit.intersection()
     value = mi.Spectrum(receivers.value)
-    a = mi.Vector3f(receivers.a)
+    a, b = mi.Vector3f(receivers.a), mi.Vector3f(receivers.b)
     # Vertex 0 is what the segment comes from. Roulette judges the walk alone, not the segment that it started from.
     path = PathState.start(1)
     active = mi.Bool(True)
@@ -249,11 +267,18 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
             active,
         )
         a -= g_continue
+        if records.delta is not None:
+            delta = onward.alive & onward.scattering.delta
+            turned, bent = through_vertex(pi, si, bsdf, b, -following.d, -ray.d, delta)
+            records.delta.write(path.k - 1, DeltaTurn(-following.d, dr.select(delta, b, 0)), delta, active)
+            a, b = a + bent, turned
         path = onward.path
         ray = following
         active = onward.alive & (path.k <= limits.max_depth)
         pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= pi.is_valid()
+        if records.delta is not None:
+            b += pi.t * a
 
 
 def _carried_off(form: str, a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:

@@ -22,6 +22,10 @@ class Stream(IntEnum):
     INDIRECT_RADIANCE = 8
     LIGHT_STEP = 9
     LIGHT_STEP_SUBPATH = 10
+    CHAIN_LINE = 11
+    CHAIN_LOBES = 12
+    CHAIN_CUTS = 13
+    CHAIN_RADIANCE = 14
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from ..boundary import direct, indirect, primary
+from ..boundary import chain, direct, indirect, primary
 from ..interior import term as interior_term
 from ..plan.term import Term
 
-TERMS: list[Term] = [interior_term.TERM, primary.TERM, direct.TERM, indirect.TERM]
+TERMS: list[Term] = [interior_term.TERM, primary.TERM, chain.TERM, direct.TERM, indirect.TERM]
 
 
 @contextmanager

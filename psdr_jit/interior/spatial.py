@@ -6,6 +6,10 @@ with v the material velocity of the surface and u_1 given by the attached camera
 parameterisation of [Zhang et al. 2020, §4, Eq. 14-17]; differentiating Mitsuba's ray-triangle intersection with an
 attached origin produces exactly this recursion. The factor of the continuation is w_k = f(ω_{k+1}) / p. The visibility
 discontinuities of this flow are left to the boundary terms.
+
+At a delta lobe the direction follows the arrival and the normal (`paths/delta_step.py`), and w_k is the lobe's value
+over its probability. Emission that is met there counts where the attached ray meets it, without a measure: no emitter
+sample could have found it, and the outline of the light is a discontinuity.
 """
 
 from __future__ import annotations
@@ -16,8 +20,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
+from ..paths.delta_step import delta_step
 from ..plan.motion import Displacements
-from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event, throughput_ratio
+from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event
 
 
 @dataclass(frozen=True)
@@ -42,8 +47,14 @@ class SpatialFlow(Flow):
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
         _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
+        onward = following.hit.d
         if self.traits.delta_lobes:
-            is_delta, ratio = vertex.onward.delta, throughput_ratio(vertex, following)
-            w, w_emission = dr.select(is_delta, ratio, w), dr.select(is_delta, ratio, w_emission)
+            is_delta = vertex.onward.delta
+            step = delta_step(ctx, si, bsdf, onward, is_delta)
+            onward = dr.select(is_delta, step.d, onward)
+            ray = mi.Ray3f(si.p, onward, 0, si.wavelengths)
+            met = moves.surface(following.hit, ray, mi.RayFlags.All)
+            value = dr.select(is_delta, emitter.eval(met, emits & is_delta), value)
+            w, w_emission = (dr.select(is_delta, step.value * inv_pdf, smooth) for smooth in (w, w_emission))
         L += dr.select(emits, w_emission * value * following.weight_emission, 0)
-        return VertexTerms(si.p, following.hit.d, L, w)
+        return VertexTerms(si.p, onward, L, w)

@@ -164,7 +164,7 @@ def flow_of(job: Job) -> Flow:
     """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
     smooth_lights = any(s.is_emitter and s.smooth for s in facts.shapes)
-    traits = SceneTraits(facts.has_delta_emitters, any(s.delta_lobes for s in facts.shapes), smooth_lights, job.tubes)
+    traits = SceneTraits(facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes)
     if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows
         return RestingFlow(job.scene, traits)
     return FLOWS[job.form](job.scene, traits)

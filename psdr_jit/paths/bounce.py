@@ -10,7 +10,7 @@ their correction here. Everything is detached.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -34,6 +34,10 @@ class PathLimits:
     refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
     tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
+
+    def beyond(self, k: mi.UInt32) -> PathLimits:
+        """Limits of paths that have `k` segments behind them already, lane by lane."""
+        return replace(self, max_depth=mi.UInt32(self.max_depth) - k)
 
 
 @dataclass

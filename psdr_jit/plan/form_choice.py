@@ -17,6 +17,8 @@ CONTACT = 0.02
 
 def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[tuple[str, ...], str]:
     """The forms that come into question, the safer one first, and the reason if there is one only."""
+    if facts.geometry_moves and facts.has_delta_lobes:
+        return ("spatial",), "directions follow mirrors and glass"
     if options.form != "auto":
         return (options.form,), "as asked for"
     if not facts.geometry_moves:

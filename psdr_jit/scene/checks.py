@@ -155,23 +155,33 @@ def check_instances(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_specular(facts: SceneFacts) -> Iterator[Finding]:
-    """Through a delta lobe the motion of a vertex depends on the motion of the direction: not modelled."""
+    """Directions follow delta lobes; what cannot be followed is refused, what is not sampled behind them is named."""
     if not facts.geometry_moves:
         return
+    beside = next((s.name for s in facts.shapes if s.kind in ("instance", "curve")), "")
     for shape in facts.shapes:
-        if shape.delta_lobes:
+        if not shape.delta_lobes:
+            continue
+        label = f"shape '{shape.name}' has the BSDF '{shape.bsdf}' with perfectly specular or pass-through lobes"
+        lobes = ", ".join(shape.delta_lobes)
+        obstacle = shape.delta_obstacle or (beside and f"the scene has an instance or a curve, '{beside}', beside it")
+        if obstacle:
             yield Finding(
                 UnsupportedError, shape.name,
-                f"shape '{shape.name}' has the BSDF '{shape.bsdf}' with perfectly specular or pass-through "
-                f"lobes ({', '.join(shape.delta_lobes)}): motion transport through specular vertices is "
-                "missing; use a rough BSDF (such as roughconductor, roughdielectric or roughplastic), or "
-                "differentiate materials and radiance only",
+                f"{label} ({lobes}) through which motion is not followed, because {obstacle}; use a rough BSDF (such "
+                "as roughconductor, roughdielectric or roughplastic), or differentiate materials and radiance only",
+            )  # fmt: skip
+        else:
+            yield Finding(
+                UnsupportedWarning, shape.name,
+                f"{label} ({lobes}): the edges of shadows, of reflections and of patterns that the sensor sees by way "
+                "of them are missing from the derivative; outlines are there. Use a rough BSDF where they matter",
             )  # fmt: skip
 
 
 def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
     """The sweeps take the weight and the direction of a delta lobe for constants (see `interior.flow`)."""
-    for shape in facts.shapes:  # moving geometry, which attaches the normals too, is refused by `check_specular`
+    for shape in facts.shapes:  # where geometry moves, directions follow the normals
         watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
         steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]
         enabled = list(shape.delta_weights) + [f"{shape.name}.{name}" for name in steering]

@@ -19,17 +19,15 @@ from .capabilities import (
     INSTANCING,
     UNSUPPORTED_SHAPES,
 )
+from .delta_lobes import blends_delta, delta_lobes, lobes_not_followed, weights_of_delta_lobes
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
-    blends_delta,
-    delta_lobes,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
     plugin_name,
     sees_frame,
-    weights_of_delta_lobes,
 )
 from .guard import require_derivatives
 from .instances import require_codes, shape_groups
@@ -58,6 +56,7 @@ class ShapeFacts:
     delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
     delta_weights: tuple[str, ...]  # enabled parameters that scale or steer a delta lobe, full names
     delta_varies: bool  # such a parameter, enabled or not, varies over the surface
+    delta_obstacle: str  # why directions cannot be followed through them, "" if they can
     blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
     patterns: tuple[str, ...]  # textures that step inside the surface, "checkerboard 'floor'", ...
     jumps: tuple[str, ...]  # whatever else is discontinuous inside the surface
@@ -126,6 +125,10 @@ class SceneFacts:
     @property
     def has_delta_emitters(self) -> bool:
         return any(emitter.delta for emitter in self.emitters)
+
+    @property
+    def has_delta_lobes(self) -> bool:
+        return any(shape.delta_lobes for shape in self.shapes)
 
     @property
     def has_light_steps(self) -> bool:
@@ -237,6 +240,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         delta_lobes=delta_lobes(graph, bsdf),
         delta_weights=delta_weights,
         delta_varies=delta_varies,
+        delta_obstacle=lobes_not_followed(graph, bsdf) if delta_lobes(graph, bsdf) else "",
         blends_delta=blends_delta(graph, bsdf),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
         jumps=jumps,

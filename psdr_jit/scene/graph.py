@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_positions
-from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS, SMOOTH_PARAMETERS
+from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS
 from .names import plugin_name, traverse
 from .params import parameter_value
 
@@ -26,8 +26,6 @@ UNEVEN_SCALE = 1e-4
 """Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
 
 
-DELTA_KINDS = ("Null", "DeltaReflection", "DeltaTransmission", "Delta1D")
-"""The lobes (names in `mi.BSDFFlags`) that have no value to evaluate, only samples."""
 
 
 class SceneGraph:
@@ -141,54 +139,6 @@ def _last(name: str) -> str:
 
 def _grad_enabled(value) -> bool:
     return value is not None and not isinstance(value, (bool, int, float, str)) and dr.grad_enabled(value)
-
-
-def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
-    """The perfectly specular and pass-through lobes of a BSDF, each with the nested plugin it comes from."""
-    lobes = {}
-    for node in graph.walk(bsdf):
-        if not isinstance(node, mi.BSDF):
-            continue
-        nested = [child for child in graph.walk(node)[1:] if isinstance(child, mi.BSDF)]
-        for kind in DELTA_KINDS:
-            bit = int(getattr(mi.BSDFFlags, kind))
-            # an adapter such as "twosided" repeats the flags of what it wraps: blame the innermost plugin
-            if node.flags() & bit and not any(child.flags() & bit for child in nested):
-                lobes[f"{plugin_name(node)}: {kind}"] = None
-    return tuple(lobes)
-
-
-def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
-    """Enabled parameters that scale or steer a delta lobe (full names), and whether one varies over the surface.
-
-    A BSDF that only wraps others (`mask`, `blendbsdf`, `normalmap`) counts when one of those has a delta lobe.
-    """
-    enabled, varies = {}, False
-    for node in graph.walk(bsdf):
-        if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
-            continue
-        own = [
-            child
-            for name, child in named_children(node)
-            if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
-        ]
-        for child in own:
-            enabled |= dict.fromkeys(graph.enabled_from(child))
-            varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
-        enabled |= dict.fromkeys(graph.enabled_full(node))
-    return tuple(enabled), varies
-
-
-def blends_delta(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
-    """Whether a `blendbsdf` mixes a delta lobe with a smooth one."""
-    blends = [node for node in graph.walk(bsdf) if plugin_name(node) == "blendbsdf"]
-    return any(_has_delta_lobe(node) and node.flags() & int(mi.BSDFFlags.Smooth) for node in blends)
-
-
-def _has_delta_lobe(bsdf: mi.BSDF) -> bool:
-    if plugin_name(bsdf) == "hair":  # says that it has a null lobe, and never samples it
-        return False
-    return any(bsdf.flags() & int(getattr(mi.BSDFFlags, kind)) for kind in DELTA_KINDS)
 
 
 def jumping_textures(graph: SceneGraph, owner: mi.Object | None) -> tuple[str, ...]:

@@ -200,7 +200,7 @@ def test_hidden_emitters():
     ({"sensor": {"type": "batch", "film": {"type": "hdrfilm", "width": 8, "height": 4}, "a": {"type": "perspective"},
                  "b": {"type": "perspective", "film": {"type": "hdrfilm", "rfilter": {"type": "box"}}}}},
      UnsupportedError, "rfilter and pixel_format"),
-    ({"box": {"type": "cube", "bsdf": {"type": "dielectric"}}}, UnsupportedError, "use a rough BSDF"),
+    ({"box": {"type": "cube", "bsdf": {"type": "hair"}}}, UnsupportedError, "use a rough BSDF"),
 ])  # fmt: skip
 def test_scenes_that_are_refused_while_something_moves(scene, error, words):
     parameter = "lamp.radiance.value" if "floor" in scene else BOX

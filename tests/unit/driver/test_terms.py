@@ -69,7 +69,7 @@ def test_it_is_planned_summed_and_gone(scene):
         assert np.allclose(image(scene, **budgets, sppx=0), before, atol=1e-6)
         with pytest.raises(OptionError, match="sppx = -1"):
             image(scene, sppx=-1)
-    assert [t.name for t in TERMS] == ["interior", "primary", "direct", "indirect"]
+    assert [t.name for t in TERMS] == ["interior", "primary", "chain", "direct", "indirect"]
     assert np.allclose(image(scene, **budgets), before, atol=1e-6)
     with pytest.raises(OptionError, match="sppx"):
         image(scene, sppx=4)
@@ -97,4 +97,4 @@ def test_backward_mode_asks_it(scene):
 def test_names_are_told_apart(llvm):
     with pytest.raises(ValueError, match="'primary'"), registered(dummy(name="primary")):
         pass
-    assert len(TERMS) == 4
+    assert len(TERMS) == 5

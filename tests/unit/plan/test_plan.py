@@ -15,7 +15,7 @@ from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.errors import OptionError, ParameterError, ZeroDerivativeWarning
 from psdr_jit.scene import io as scene_io
 
-ALL = {"interior", "primary", "direct", "indirect"}
+ALL = {"interior", "primary", "direct", "indirect"}  # that a scene without mirrors and glass can need
 SEEDS = 8
 
 

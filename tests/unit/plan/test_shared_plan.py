@@ -35,7 +35,7 @@ def test_gradient_takes_a_plan_and_renders_each_term_once(scene, plan):
     free = psdr_jit.gradient(scene, BOX, MOVE, spp=16, seeds=4)
     given = psdr_jit.gradient(scene, BOX, MOVE, seeds=4, integrator={"type": "psdr_path", "plan": plan})
     assert np.sum(free.total * given.total) / np.sum(free.total**2) == pytest.approx(1, abs=0.02)
-    assert set(given.terms) == {"interior", "primary", "direct", "indirect"}
+    assert set(given.terms) == {"interior", "primary", "chain", "direct", "indirect"}
     for name, image in given.terms.items():
         assert image.any() == plan.term(name).runs
     assert not np.allclose(given.terms["primary"], given.terms["direct"])

@@ -1,0 +1,231 @@
+"""The boundary seen through mirrors and glass: steps of what is seen along a chain of delta vertices from the sensor.
+
+In a mirror or behind glass an edge cannot be connected to the sensor: no closed form says where on the film it is seen.
+The film is searched instead. Along a horizontal or vertical line X on it the view steps where two neighbouring camera
+rays, followed through their chains, end on different surfaces (`chain_search`). The curve that is crossed there
+(`chain_outline`) is met by the chain's last ray where F(X, θ) = 0, so the crossing moves by Ẋ = −F_θ/F_X, and the
+derivative of the image receives
+
+    h(p) · (L_a − L_b) · Ẋ / (lines per pixel),        a before b along the line,
+
+with radiances L that are traced with common random numbers, times the throughput of the chain. A line along the curve
+would make 1/F_X blow up: with lines in both directions and the weights F_x²/(F_x² + F_y²) and F_y²/(F_x² + F_y²) what
+is left is −F_θ F_X/(F_x² + F_y²). F_x, F_y and F_θ are derivatives of one attached chain (`chain_sweeps`); the sensor
+is attached as well. No virtual camera, no root search, no count of solutions: as the chain begins at the film, all of
+that is settled by tracing it. Steps of the first segment belong to `primary`.
+
+Seen are outlines, creases, curves along which surfaces cut, and shading outlines. Left out are patterns on surfaces,
+and what is seen by more than `chain_trace.CHAIN_DEPTH` segments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.ad import accumulate, backpropagate, tangents
+from ..core.low_discrepancy import lane_sampler
+from ..core.streams import Stream, stream_seed
+from ..options import Options
+from ..paths.walk import NoSink, walk
+from ..plan.job import Job, passes
+from ..plan.motion import Motion
+from ..plan.plan import Geometry
+from ..plan.reasons import steps_rest
+from ..plan.term import Term, Verdict
+from ..scene.facts import SceneFacts
+from .chain_outline import AnalyticShapes, Curve, crossed_curve
+from .chain_search import Lines, find_crossings
+from .chain_sweeps import AtRest, carry_adjoints, carry_tangents
+from .chain_trace import ChainRecords, Pair
+
+NAME = "chain"
+
+#: Largest distance on the film from a crossing to the curve that it is thought to belong to [px]: halving ends closer.
+MOST_OFF = 0.02
+
+#: Memory of one line: an interval, its comparison and its share of what is found.
+BYTES = 256
+
+
+@dataclass
+class Steps:
+    """Crossings, ready to be moved; one entry each, detached."""
+
+    p: mi.Point2f  # film position [px]
+    film: mi.Point2f  # the same in [0, 1]² of the crop window
+    aperture: mi.Point2f
+    k: mi.UInt32  # segment that parts
+    curve: Curve
+    value: mi.Spectrum  # contribution per unit of F_θ
+    wavelengths: mi.Color0f
+    valid: mi.Bool
+
+
+def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
+    """L_a − L_b: what arrives along the segments that part, times the chains' throughputs."""
+    n = dr.width(pair.k)
+    index = dr.arange(mi.UInt32, 2 * n)
+    second, i = (index & 1) == 1, index >> 1
+    of = dr.gather(Pair, pair, i)
+    hit, β = dr.select(second, of.b, of.a), dr.select(second, of.β_b, of.β_a)
+    rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), i)
+    ray = mi.Ray3f(hit.o, hit.d, 0, dr.gather(type(wavelengths), wavelengths, i))
+    limits = job.limits.beyond(of.k)
+    L, _, _ = walk(job.scene, rng, ray, hit.intersection(), limits, NoSink(), mi.Bool(True), mi.Bool(True))
+    L = L * β
+    dr.eval(L)
+    even = 2 * dr.arange(mi.UInt32, n)
+    step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
+    return job.call.counters.rejected.keep_finite(step)
+
+
+def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
+    """Everything about the crossings but how fast they move; None if there are none."""
+    lines = Lines.of(job)
+    found = find_crossings(lines)
+    if found is None:
+        return None
+    chain = ChainRecords(dr.width(found.k), lines.world.depth)
+    pair = lines.compare(found.at, chain)
+    dr.eval(pair, chain.hits)
+    curve = crossed_curve(AnalyticShapes.of(job), pair)
+    dr.eval(curve)
+    line = lines.line(found.at.sample)
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
+    ΔL = _radiances(job, pair, wavelengths) * weight
+
+    p = line.at(found.at.lo)
+    F_x, F_y = (_film_slope(lines, chain, pair, curve, (p, line, axis)) for axis in (0, 1))
+    slope2 = dr.square(F_x) + dr.square(F_y)
+    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
+    along = dr.select(line.horizontal, F_x, F_y)
+    per_F = dr.select(valid, -along / slope2 * found.at.weight / lines.per_pixel, 0)
+    steps = Steps(p, lines.film(p), line.aperture, pair.k, curve, ΔL * per_F, wavelengths, valid)
+    dr.eval(steps)
+    return steps, chain
+
+
+def _film_slope(lines: Lines, chain: ChainRecords, pair: Pair, curve: Curve, at: tuple) -> mi.Float:
+    """Derivative of F by the film position [m/px], along the axis of `at`: (position, line, axis)."""
+    p, line, axis = at
+    q = mi.Point2f(p)
+    with dr.resume_grad():
+        dr.enable_grad(q)
+    with dr.resume_grad(q):
+        dr.set_grad(q, mi.Point2f(1 - axis, axis))
+        ray, _ = lines.job.sensor.sample_ray(0, line.wavelength, lines.film(q), line.aperture)
+        first = chain.segment(mi.UInt32(0), mi.Bool(True))
+        start = ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d))
+        o_grad, d_grad = tangents(start, ray.d)
+    return _slope(lines.job, chain, (pair.k, curve), (o_grad, d_grad), AtRest(lines.job.sensor))
+
+
+def _smooth(job: Job) -> bool:
+    """Is there a shape with interpolated normals?"""
+    return any(s.smooth for s in job.facts.shapes)
+
+
+def _slope(job: Job, chain: ChainRecords, end: tuple, camera: tuple, motion: Motion) -> mi.Float:
+    """Tangent of F at the `end` of chains, (segment, curve), given the tangents `camera` of their first rays."""
+    k, curve = end
+    o_grad, d_grad = carry_tangents(chain, k, *camera, motion)
+    o, d = mi.Point3f(curve.line.o), mi.Vector3f(curve.line.d)
+    with motion.attached(o, d) as moving:
+        dr.set_grad(o, o_grad)
+        dr.set_grad(d, d_grad)
+        return tangents(curve.attached_F(o, d, moving, _smooth(job)))
+
+
+def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """The motion of the camera rays at fixed film positions: of their starts and directions, attached."""
+    first = chain.segment(mi.UInt32(0), mi.Bool(True))
+    start = moving.of_camera(steps.film, steps.aperture, first.o)
+    return start, moving.of_view(steps.film, steps.aperture, first.d)
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image along the tangents set on the scene's parameters. Detached."""
+    image = films.black(job.film)
+    with dr.suspend_grad():
+        for share, part in passes(job, BYTES):
+            found = _steps(part)
+            if found is None:
+                continue
+            steps, chain = found
+            camera = mi.Vector3f(0), mi.Vector3f(0)
+            if job.facts.camera_moves:
+                with job.motion.attached() as moving:
+                    camera = tangents(*_camera(moving, steps, chain))
+            F_grad = _slope(part, chain, (steps.k, steps.curve), camera, job.motion)
+            image += share * _splat(job, steps, job.call.counters.rejected.keep_finite(steps.value * F_grad))
+    return image
+
+
+def _splat(job: Job, steps: Steps, value: mi.Spectrum) -> mi.TensorXf:
+    """The first surface is the same on both sides, and so is the coverage of the film."""
+    return films.develop_boundary(job.film, steps.p, value, mi.Float(0), steps.wavelengths, steps.valid)
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters."""
+    with dr.suspend_grad():
+        for share, part in passes(job, BYTES):
+            found = _steps(part)
+            if found is None:
+                continue
+            steps, chain = found
+            λ = share * _adjoint(job, steps, grad_in)
+            λ = dr.select(dr.isfinite(λ), λ, 0)
+            o, d = mi.Point3f(steps.curve.line.o), mi.Vector3f(steps.curve.line.d)
+            with job.motion.attached(o, d) as moving:
+                accumulate(λ * steps.curve.attached_F(o, d, moving, _smooth(part)))
+                λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
+            λ_o, λ_d = carry_adjoints(chain, steps.k, λ_o, λ_d, job.motion)
+            if job.facts.camera_moves:
+                with job.motion.attached() as moving:
+                    start, direction = _camera(moving, steps, chain)
+                    accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))
+            dr.eval()
+
+
+def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:
+    """Derivative of ⟨grad_in, image⟩ by F_θ of every crossing."""
+    with dr.resume_grad():
+        F_grad = dr.zeros(mi.Float, dr.width(steps.k))
+        dr.enable_grad(F_grad)
+    with dr.resume_grad(F_grad):
+        backpropagate(_splat(job, steps, steps.value * F_grad), grad_in)
+        return dr.grad(F_grad)
+
+
+def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
+    """Something must be seen through a delta lobe, and move."""
+    if steps_rest(facts):
+        return False, steps_rest(facts)
+    if not any(s.delta_lobes for s in facts.shapes):
+        return False, "no surface is a mirror, smooth glass or a window: everything is seen directly"
+    if not (facts.shapes_move or facts.camera_moves):
+        return False, "only lights without a shape move: every outline stays where it is on the film"
+    if options.depth_limit < 2:
+        return False, f"max_depth = {options.max_depth}: nothing is seen through mirrors and glass"
+    return True, "outlines move in mirrors and behind glass"
+
+
+def cost(form: str, sky: bool) -> float:
+    """Time of a line relative to a path of the interior term (mirror, cube and ball of glass at 48², two cores)."""
+    return 4.0
+
+
+TERM = Term(
+    name=NAME,
+    budget="spps",
+    streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE),
+    needed=needed,
+    cost=cost,
+    forward=forward,
+    backward=backward,
+)

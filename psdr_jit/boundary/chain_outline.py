@@ -1,0 +1,194 @@
+"""Which curve has been crossed where two neighbouring chains part, and how the line of sight meets it.
+
+Along the crossed curve the line of sight x(s) = o + s d satisfies F = 0, to first order in everything that can move
+
+    F = Σ_i c_i · (o + t d − m_i),        (Σ_i c_i) · d = 0,
+
+with m_i one or two material points and t the distance. On an edge, m is a point of it and c ∝ τ × d. On the outline of
+a sphere or cylinder, m is the point of contact and c the normal there: an outline moves with the normal velocity of the
+surface, and a turn of the line of sight about m moves it along the tangent plane. Where two surfaces cut, with normals
+n_i, the curve moves by both: c_1 = (n_2·d) n_1, c_2 = −(n_1·d) n_2. And where an interpolated normal n turns away from
+the line of sight, F = n·d itself, at the point that the line meets.
+
+The nearer surface is the one that ends. If both are equally near, they touch along an edge of the one or of the other
+(a crease), or cut into each other: the curve that the line of sight passes closest by is taken. A shape that goes on,
+seen from the other side of its shading normal, has a shading outline there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Hit
+from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
+from ..plan.job import Job
+from ..plan.motion import Displacements
+from ..plan.probe_motion import registry_table
+from .chain_trace import Pair
+
+#: Difference of distances, relative to them, up to which two surfaces may touch there.
+TOUCHING = 1e-3
+
+#: How much closer the edge of the farther surface, and a cut, must be passed by to be preferred.
+FARTHER, CUT = 2.0, 4.0
+
+#: Corners of a triangle in barycentric coordinates of its hits.
+CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+
+
+@dataclass
+class Outline:
+    """The curve on which a surface ends, near a line of sight. Detached."""
+
+    m: Hit  # the material point on it: a hit at distance 0
+    n: mi.Vector3f  # unit, across curve and line of sight
+    gap: mi.Float  # distance of the line of sight, signed by n [m]; infinite: there is no curve
+
+
+@dataclass
+class Curve:
+    """What has been crossed: the c_i and m_i of F. Detached."""
+
+    line: Hit  # the line of sight, and what it meets
+    shading: mi.Bool  # F = n·d
+    m1: Hit
+    m2: Hit
+    c1: mi.Vector3f
+    c2: mi.Vector3f
+    t: mi.Float
+    F: mi.Float  # where the chain was traced [m]
+    valid: mi.Bool
+
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, smooth: bool) -> mi.Float:
+        """F of the attached line of sight (o, d) and of what moves. `smooth`: there may be shading outlines."""
+        F = dr.dot(self.c1 + self.c2, o + self.t * d)
+        F -= dr.dot(self.c1, moving.of_surface(self.m1)) + dr.dot(self.c2, moving.of_surface(self.m2))
+        if not smooth:
+            return F
+        si = moving.surface(self.line, mi.Ray3f(o, d), mi.RayFlags.All)
+        n = dr.select(self.shading, mi.Vector3f(si.sh_frame.n), 0)
+        return dr.select(self.shading, dr.dot(n, d), F)
+
+
+@dataclass(frozen=True)
+class AnalyticShapes:
+    """Spheres, disks and cylinders of a scene. Host object."""
+
+    number: mi.UInt32  # by registry index of a shape: 1 + its place below, 0: it is none of these
+    columns: tuple[mi.Vector3f, ...]  # of their object-to-world maps
+    kind: mi.UInt32
+
+    @staticmethod
+    def of(job: Job) -> AnalyticShapes | None:
+        chosen = [s for s in job.facts.shapes if s.index >= 0 and s.plugin in CURVES_OF]
+        if not chosen:
+            return None
+        shapes = tuple(job.scene.shapes()[s.index] for s in chosen)
+        number = sum(registry_table(job.scene, {s.index}) * (i + 1) for i, s in enumerate(chosen))
+        columns = tuple(dr.detach(c) for c in attached_to_world(shapes, dr.arange(mi.UInt32, len(shapes))))
+        kind = mi.UInt32([list(CURVES_OF).index(s.plugin) for s in chosen])
+        dr.eval(number, columns, kind)
+        return AnalyticShapes(number, columns, kind)
+
+
+def _resting(hit: Hit, m: mi.Point3f, prim_uv: mi.Point2f) -> Hit:
+    """The point `m` of the surface that `hit` meets, as a hit at distance 0."""
+    nothing = dr.zeros(mi.Float, dr.width(hit.t))
+    return Hit(mi.Point3f(m), mi.Vector3f(hit.d), nothing, hit.shape, hit.prim_index, mi.Point2f(prim_uv))
+
+
+def _closer(a: Outline, b: Outline) -> Outline:
+    return dr.select(dr.abs(b.gap) < dr.abs(a.gap), b, a)
+
+
+def _edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
+    """The side of the triangle at the end of `hit`, which it meets at `p`, that `line` passes closest by."""
+    shape = dr.reinterpret_array(mi.ShapePtr, hit.shape)
+    on_mesh = (hit.shape != 0) & shape.is_mesh()
+    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, hit.shape, 0))
+    corners = mesh.face_indices(hit.prim_index, on_mesh)
+    x = [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
+    best = Outline(_resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        along = x[j] - x[i]
+        n = dr.cross(along, line.d)
+        length = dr.norm(n)
+        n = n / length
+        s = dr.clip(dr.dot(p - x[i], along) / dr.squared_norm(along), 0, 1)
+        uv = dr.lerp(mi.Point2f(CORNERS[i]), mi.Point2f(CORNERS[j]), s)
+        gap = dr.select(on_mesh & (length > 0), dr.dot(n, line.o - x[i]), dr.inf)
+        best = _closer(best, Outline(_resting(hit, x[i] + s * along, uv), n, gap))
+    return best
+
+
+def _analytic_outline(shapes: AnalyticShapes, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
+    """The same of shapes without triangles: the contours of spheres and tubes, the rims of disks and tubes."""
+    number = dr.gather(mi.UInt32, shapes.number, hit.shape, hit.shape != 0)
+    there, i = number != 0, dr.maximum(number, 1) - 1
+    columns = tuple(dr.gather(mi.Vector3f, c, i) for c in shapes.columns)
+    kind = dr.gather(mi.UInt32, shapes.kind, i)
+    sphere, disk = (kind == list(CURVES_OF).index(name) for name in ("sphere", "disk"))
+    o, d, q = (local_viewpoint(columns, mi.Vector4f(v.x, v.y, v.z, w)) for v, w in ((line.o, 1), (line.d, 0), (p, 1)))
+    flat = dr.select(sphere, mi.Vector3f(1), mi.Vector3f(1, 1, 0))  # a tube's contour is that of a circle
+    o3, d3 = mi.Vector3f(o.x, o.y, o.z), mi.Vector3f(d.x, d.y, d.z)
+    closest = o3 - d3 * (dr.dot(o3 * flat, d3 * flat) / dr.squared_norm(d3 * flat))
+    radial = dr.normalize(closest * flat)
+    contact = mi.Point3f(radial.x, radial.y, dr.select(sphere, radial.z, closest.z))
+    m = transform_point(columns, contact)
+    n = dr.normalize(transform_vector(columns, radial))
+    gap = dr.select(there & ~disk, dr.dot(n, line.o - m), dr.inf)
+    contour = Outline(_resting(hit, m, mi.Point2f(0)), n, gap)
+
+    rim = dr.normalize(mi.Vector3f(q.x, q.y, 0))
+    height = dr.select(disk | (q.z < 0.5), mi.Float(0), 1)
+    m = transform_point(columns, mi.Point3f(rim.x, rim.y, height))
+    n = dr.normalize(dr.cross(transform_vector(columns, mi.Vector3f(-rim.y, rim.x, 0)), line.d))
+    gap = dr.select(there & ~sphere, dr.dot(n, line.o - m), dr.inf)
+    return _closer(contour, Outline(_resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap))
+
+
+def _outline(shapes: AnalyticShapes | None, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
+    edge = _edge_outline(hit, p, line)
+    return edge if shapes is None else _closer(edge, _analytic_outline(shapes, hit, p, line))
+
+
+def _interaction(hit: Hit) -> mi.SurfaceInteraction3f:
+    return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.All)
+
+
+def crossed_curve(shapes: AnalyticShapes | None, pair: Pair) -> Curve:
+    """The curve between the ends of the two chains, for the line of sight of the first."""
+    line = mi.Ray3f(pair.a.o, pair.a.d)
+    first = pair.a.intersection().t <= pair.b.intersection().t
+    near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
+    si_near, si_far = _interaction(near), _interaction(far)
+    best = _outline(shapes, near, si_near.p, line)
+    touching = (far.shape != 0) & (far.t - near.t < TOUCHING * far.t)
+    other = _outline(shapes, far, si_far.p, line)
+    closer = touching & (FARTHER * dr.abs(other.gap) < dr.abs(best.gap))
+    best = dr.select(closer, other, best)
+
+    c1, c2 = dr.dot(si_far.n, line.d) * si_near.n, -dr.dot(si_near.n, line.d) * si_far.n
+    scale = dr.rcp(dr.norm(c1 + c2))
+    t = dr.dot(si_near.p - line.o, line.d)
+    x = line.o + t * line.d
+    F_cut = (dr.dot(c1, x - si_near.p) + dr.dot(c2, x - si_far.p)) * scale
+    cut = touching & dr.isfinite(scale) & (CUT * dr.abs(F_cut) < dr.abs(best.gap))
+
+    h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
+    shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)
+    F = dr.select(shading, dr.select(first, h_near, h_far), dr.select(cut, F_cut, best.gap))
+    return Curve(
+        line=pair.a,
+        shading=shading,
+        m1=dr.select(cut, _resting(near, si_near.p, near.prim_uv), best.m),
+        m2=dr.select(cut, _resting(far, si_far.p, far.prim_uv), best.m),
+        c1=dr.select(cut, mi.Vector3f(c1 * scale), best.n),
+        c2=dr.select(cut, mi.Vector3f(c2 * scale), 0),
+        t=dr.select(cut, t, dr.dot(best.m.o - line.o, line.d)),
+        F=F,
+        valid=dr.isfinite(F),
+    )

@@ -1,0 +1,84 @@
+"""How the line of sight at the end of a chain moves, with the film point or with θ, and its adjoint.
+
+A chain's segment k starts at the attached ray (o, d); the surface it meets and the delta lobe that it leaves by give
+those of segment k + 1 (`paths/delta_step.py`). Forward, the tangents (ȯ, ḋ) are carried along the recorded segments;
+backward, the adjoints (λ_o, λ_d) of the last line of sight are carried back to the camera ray, and what they say about
+the surfaces on the way is deposited on these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.ad import tangents
+from ..core.records import Hit
+from ..paths.delta_step import delta_step
+from ..plan.motion import Displacements, Motion, SceneDisplacements
+from .chain_trace import ChainRecords
+
+
+@dataclass(frozen=True)
+class AtRest(Motion):
+    """Nothing moves but what is asked about."""
+
+    sensor: mi.Sensor
+
+    @contextmanager
+    def attached(self, *variables) -> Iterator[Displacements]:
+        with dr.resume_grad():
+            dr.enable_grad(*variables)
+        with dr.resume_grad(*variables):
+            yield SceneDisplacements(self.sensor, None)  # curves are refused beside delta lobes
+
+    def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        return mi.Vector3f(0), mi.Vector3f(0)
+
+
+def _onward(hit: Hit, d_next: mi.Vector3f, ray: mi.Ray3f, moving: Displacements, active: mi.Bool):
+    """The attached ray `(x, d)` that leaves the surface at the end of `hit` in the direction `d_next`."""
+    si = moving.surface(hit, ray, mi.RayFlags.All)
+    step = delta_step(mi.BSDFContext(), si, si.bsdf(), d_next, active)
+    return si.p, step.d
+
+
+@dr.syntax
+def carry_tangents(chain: ChainRecords, last: mi.UInt32, o_grad: mi.Vector3f, d_grad: mi.Vector3f, motion: Motion):
+    """Tangents `(ȯ, ḋ)` of the ray of segment `last`, given those of the camera ray. Detached."""
+    k = mi.UInt32(0)
+    o_grad, d_grad = mi.Vector3f(o_grad), mi.Vector3f(d_grad)
+    active = k < last
+    while dr.hint(active, label="psdr.chain.forward", exclude=[chain, motion]):
+        hit, d_next = chain.segment(k, active), chain.segment(k + 1, active).d
+        o, d = mi.Point3f(hit.o), mi.Vector3f(hit.d)
+        with motion.attached(o, d) as moving:
+            dr.set_grad(o, o_grad)
+            dr.set_grad(d, d_grad)
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
+            x_grad, onward_grad = tangents(x, onward)
+        o_grad, d_grad = mi.Vector3f(x_grad), mi.Vector3f(onward_grad)
+        k += 1
+        active = k < last
+    return o_grad, d_grad
+
+
+@dr.syntax
+def carry_adjoints(chain: ChainRecords, last: mi.UInt32, λ_o: mi.Vector3f, λ_d: mi.Vector3f, motion: Motion):
+    """Adjoints `(λ_o, λ_d)` of the camera ray, given those of the ray of segment `last`; θ receives its share."""
+    k = mi.UInt32(last)
+    λ_o, λ_d = mi.Vector3f(λ_o), mi.Vector3f(λ_d)
+    active = k > 0
+    while dr.hint(active, label="psdr.chain.backward", exclude=[chain, motion]):
+        k -= 1
+        hit, d_next = chain.segment(k, active), chain.segment(k + 1, active).d
+        o, d = mi.Point3f(hit.o), mi.Vector3f(hit.d)
+        with motion.attached(o, d) as moving:
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
+            dr.backward_from(dr.dot(λ_o, x) + dr.dot(λ_d, onward))
+            λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
+        active = k > 0
+    return λ_o, λ_d

@@ -1,0 +1,91 @@
+"""Sensor subpaths through delta lobes: what a vertex does to covectors on its position and on its direction.
+
+In travelling order, away from the sensor, a ray is displaced by û where it meets the vertex and turned by ω̇_in. The
+vertex slides along it by u, its normal turns by ṅ(û) (it is another place of a curved surface), and the direction that
+leaves it turns by R_ω ω̇_in + R_n ṅ (`paths/delta_step.py`). Subpaths are walked the other way, from the edge to the
+sensor, and carry the covectors a on u and b on the direction that leaves:
+
+    b_in = R_ωᵀ b,        a_in = (slide)ᵀ a + (∂n/∂û)ᵀ R_nᵀ b,        b of the next vertex: b_in + r a_in
+
+with r the distance to it; at a smooth vertex directions are kept and b_in = 0. What the vertex' own motion adds is
+b·(the direction that leaves, with the arrival fixed), taken from the record (`DeltaRecords.motion`). R and ∂n/∂û are
+those of Mitsuba's own attached interactions and BSDFs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Hit
+from ..core.varying import varying
+from ..paths.delta_step import delta_step
+from ..plan.motion import Displacements
+
+
+@dataclass
+class DeltaTurn:
+    """How a subpath passes a delta lobe. Detached."""
+
+    ω_in: mi.Vector3f  # unit direction in which the vertex is reached from the sensor's side
+    b: mi.Vector3f  # covector on the direction that leaves it; 0 at smooth vertices
+
+
+class DeltaRecords:
+    """The turns of `lanes` subpaths, vertex-major as in `SubpathRecords`; not a PyTree, so never loop state."""
+
+    BYTES = 4 * 6  # of one vertex
+
+    def __init__(self, lanes: int, depth: int):
+        size = lanes * depth
+        self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
+        self.turns = DeltaTurn(dr.zeros(mi.Vector3f, size), dr.zeros(mi.Vector3f, size))
+        self.leaves = dr.zeros(mi.Bool, lanes)  # by lane: does the path leave its first vertex by a delta lobe?
+        dr.make_opaque(self.turns, self.leaves)
+
+    def write(self, k: mi.UInt32, turn: DeltaTurn, delta: mi.Bool, active: mi.Bool) -> None:
+        dr.scatter(self.turns, turn, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
+        dr.scatter(self.leaves, delta, self.lane, active & (k == 0), mode=dr.ReduceMode.Permute)
+
+    def motion(self, hit: Hit, moving: Displacements) -> mi.Float:
+        """Attached b·(direction that leaves), the arrival fixed, of every vertex `hit` (flat arrays)."""
+        t = self.turns
+        active = dr.any(t.b != 0)
+        there = Hit(hit.o + hit.t * hit.d - hit.t * t.ω_in, t.ω_in, hit.t, hit.shape, hit.prim_index, hit.prim_uv)
+        there.shape = dr.select(active, hit.shape, 0)
+        si = moving.surface(there, mi.Ray3f(there.o, there.d), mi.RayFlags.All)
+        step = delta_step(mi.BSDFContext(), si, si.bsdf(), -hit.d, active)
+        return dr.select(active, dr.dot(t.b, step.d), 0)
+
+
+def through_vertex(
+    pi: mi.PreliminaryIntersection3f,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    b: mi.Vector3f,
+    ω_in: mi.Vector3f,
+    ω_out: mi.Vector3f,
+    delta: mi.Bool,
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """`(b_in, (∂n/∂û)ᵀ R_nᵀ b)` of a covector `b` on ω_out, both 0 where the lobe is not `delta`. Detached."""
+    with dr.resume_grad():
+        n, ω = mi.Vector3f(si.sh_frame.n), mi.Vector3f(ω_in)
+        dr.enable_grad(n, ω)
+    with dr.resume_grad(n, ω):
+        reached = mi.SurfaceInteraction3f(si)
+        reached.sh_frame = mi.Frame3f(mi.Normal3f(n))
+        reached.wi = reached.to_local(-ω)
+        step = delta_step(mi.BSDFContext(), reached, bsdf, ω_out, delta)
+        dr.backward_from(dr.select(delta, dr.dot(b, step.d), 0))
+        b_in, b_n = mi.Vector3f(dr.grad(ω)), mi.Vector3f(dr.grad(n))
+    with dr.resume_grad():
+        û = mi.Vector3f(0, 0, 0) + dr.zeros(mi.Vector3f, dr.width(b))
+        dr.enable_grad(û)
+    with dr.resume_grad(û):
+        ray = mi.Ray3f(si.p - pi.t * ω_in + û, ω_in)
+        there = pi.compute_surface_interaction(ray, mi.RayFlags.All, delta)
+        dr.backward_from(dr.select(delta, dr.dot(b_n, there.sh_frame.n), 0))
+        bent = mi.Vector3f(dr.grad(û))
+    return dr.select(delta, b_in, 0), dr.select(delta, bent, 0)

@@ -1,0 +1,76 @@
+"""Perfectly specular and pass-through lobes: where they are, what scales them, and whether they can be followed."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from .capabilities import SMOOTH_PARAMETERS
+from .graph import SceneGraph, named_children, plugin_name
+
+BENT_NORMALS = frozenset({"bumpmap", "normalmap"})
+
+DELTA_KINDS = ("Null", "DeltaReflection", "DeltaTransmission", "Delta1D")
+"""The lobes (names in `mi.BSDFFlags`) that have no value to evaluate, only samples."""
+
+
+def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
+    """The perfectly specular and pass-through lobes of a BSDF, each with the nested plugin it comes from."""
+    lobes = {}
+    for node in graph.walk(bsdf):
+        if not isinstance(node, mi.BSDF):
+            continue
+        nested = [child for child in graph.walk(node)[1:] if isinstance(child, mi.BSDF)]
+        for kind in DELTA_KINDS:
+            bit = int(getattr(mi.BSDFFlags, kind))
+            # an adapter such as "twosided" repeats the flags of what it wraps: blame the innermost plugin
+            if node.flags() & bit and not any(child.flags() & bit for child in nested):
+                lobes[f"{plugin_name(node)}: {kind}"] = None
+    return tuple(lobes)
+
+
+def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
+    """Enabled parameters that scale or steer a delta lobe (full names), and whether one varies over the surface.
+
+    A BSDF that only wraps others (`mask`, `blendbsdf`, `normalmap`) counts when one of those has a delta lobe.
+    """
+    enabled, varies = {}, False
+    for node in graph.walk(bsdf):
+        if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
+            continue
+        own = [
+            child
+            for name, child in named_children(node)
+            if not isinstance(child, mi.BSDF) and (plugin_name(node), name) not in SMOOTH_PARAMETERS
+        ]
+        for child in own:
+            enabled |= dict.fromkeys(graph.enabled_from(child))
+            varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
+        enabled |= dict.fromkeys(graph.enabled_full(node))
+    return tuple(enabled), varies
+
+
+def lobes_not_followed(graph: SceneGraph, bsdf: mi.BSDF | None) -> str:
+    """Why directions that leave a BSDF by its delta lobes cannot be told from the surface alone; "" if they can."""
+    nodes = [node for node in graph.walk(bsdf, skip=(mi.Shape,)) if isinstance(node, mi.BSDF)]
+    if not any(_has_delta_lobe(node) for node in nodes):
+        return "'hair' has a lobe that it never samples" if any(plugin_name(n) == "hair" for n in nodes) else ""
+    for node in nodes:
+        name = plugin_name(node)
+        if name in BENT_NORMALS:
+            return f"'{name}' bends the normals of a perfectly specular material"
+        inner = [child for child in graph.walk(node, skip=(mi.Shape,))[1:] if isinstance(child, mi.BSDF)]
+        if name == "mask" and any(_has_delta_lobe(child) for child in inner):
+            return "'mask' covers a perfectly specular material"
+    return ""
+
+
+def blends_delta(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a `blendbsdf` mixes a delta lobe with a smooth one."""
+    blends = [node for node in graph.walk(bsdf) if plugin_name(node) == "blendbsdf"]
+    return any(_has_delta_lobe(node) and node.flags() & int(mi.BSDFFlags.Smooth) for node in blends)
+
+
+def _has_delta_lobe(bsdf: mi.BSDF) -> bool:
+    if plugin_name(bsdf) == "hair":  # says that it has a null lobe, and never samples it
+        return False
+    return any(bsdf.flags() & int(getattr(mi.BSDFFlags, kind)) for kind in DELTA_KINDS)
