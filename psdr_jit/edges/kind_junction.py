@@ -18,6 +18,12 @@ from .location import EdgeLocation
 from .rows import EdgeRows
 from .wedges import Wedges, meeting_wedges
 
+#: Height at which Mitsuba starts rays above a surface, relative to 1 + the largest coordinate (`math::RayEpsilon`).
+MITSUBA_LIFT = 8.9e-5
+
+#: Side rays stay clear of that by this factor; of surfaces that meet almost flush, as if by this sine of their angle.
+CLEAR_OF_LIFT, LEAST_SLANT = 2.0, 0.05
+
 
 @dataclass(frozen=True)
 class Junctions(BetweenFaces):
@@ -48,7 +54,16 @@ class Junctions(BetweenFaces):
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         index = dr.gather(mi.UInt32, self.index, row, active)
         x, dx = bend(self.curves, index, *straight_point(self.rows, row, t, active), active)
-        return on_fixed(x, dx, self.centre, dr.gather(mi.Float, self.rows.blur, row, active), active)
+        return on_fixed(x, dx, self.centre, self._blur(row, x, active), active)
+
+    def _blur(self, row: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> mi.Float:
+        """How far beside the curve a point of one surface is in the shadow of the other, if that overhangs [m].
+
+        Mitsuba lifts rays off a surface along its normal: closer to the curve they start above what overhangs.
+        """
+        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        lift = MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
+        return CLEAR_OF_LIFT * lift / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
 
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         side = dr.cross(dx, ω)

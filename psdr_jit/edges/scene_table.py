@@ -34,7 +34,7 @@ from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
-from .smooth_faces import smooth_faces, warn_about_coarse
+from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -160,7 +160,8 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
     if faces is None:
         return []
     if job.options.depth_limit > 2 or any(not e.delta for e in job.facts.emitters):  # surfaces are lights as well
-        warn_about_coarse(faces, job.call.memory)
+        sky = job.scene.environment() is not None
+        warn_about_coarse(faces, COARSE_UNDER_SKY if sky else COARSE, job.call.memory)
     return [ShadingOutlines(faces, centre)]
 
 

@@ -18,6 +18,9 @@ from .segments import attached_positions, is_smooth, known_topology
 #: which shading and shape no longer belong together.
 COARSE, COARSE_SHARE = 35.0, 0.02
 
+#: The same angle under a sky, through which the plane of every face passes.
+COARSE_UNDER_SKY = 20.0
+
 #: Of an integrator: the meshes that have been looked at, by name.
 LOOKED_AT: Slot[set[str]] = Slot(set)
 
@@ -85,8 +88,8 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
     return found
 
 
-def warn_about_coarse(faces: SmoothFaces, memory: Memory) -> None:
-    """Name meshes whose shading normals are far off their faces, once each.
+def warn_about_coarse(faces: SmoothFaces, limit: float, memory: Memory) -> None:
+    """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
 
     Such a face still reflects light along its own plane. Where that plane passes through a light, or through a surface
     that sends light, as much of it as sinks below the plane is lost in a step, which no edge of the mesh stands for.
@@ -100,14 +103,14 @@ def warn_about_coarse(faces: SmoothFaces, memory: Memory) -> None:
     least = mi.Float(1)
     for n_s in n:
         least = dr.minimum(least, dr.abs(dr.dot(n_s, n_g)) / (dr.norm(n_s) * area))
-    coarse = dr.select(least < math.cos(math.radians(COARSE)), area, 0)
+    coarse = dr.select(least < math.cos(math.radians(limit)), area, 0)
     for i in unknown:
         memory[LOOKED_AT].add(faces.meshes[i].id())
         own = faces.rows.shape == i
         share = dr.sum(dr.select(own, coarse, 0)) / dr.sum(dr.select(own, area, 0))
         if float(share[0]) > COARSE_SHARE:
             warn_once(
-                f"mesh '{faces.meshes[i].id()}' is shaded with normals that are more than {COARSE:g} degrees off its "
+                f"mesh '{faces.meshes[i].id()}' is shaded with normals that are more than {limit:g} degrees off its "
                 "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
                 "reflects is missing from the derivative; split its normals at sharp edges, set face_normals, or use "
                 "a finer mesh",

@@ -91,3 +91,19 @@ def test_they_are_updated_with_the_shapes(llvm):
     assert count() == 0
     lift(0.0)
     assert count() == there == count()
+
+
+def test_under_an_overhang_it_is_dark(llvm):
+    """A panel leans over the place where it meets the floor: no step of light there, however close one looks."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    look = T().look_at(origin=[0.1, 0.2, 3], target=[0, 0, 0.05], up=[0, 1, 0])
+    white = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    scene = mi.load_dict({
+        "type": "scene", "camera": {"type": "perspective", "fov": 4, "to_world": look, "film": film},
+        "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(4), "bsdf": white},
+        "panel": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 78).scale(1.5), "bsdf": white},
+        "lamp": {"type": "point", "position": [0.2, 3, 0.3], "intensity": 10.0},
+    }, optimize=False)  # fmt: skip
+    image = forward(perturb(scene, "panel.to_world", (0, 0, 1)), {"type": "psdr_path", "max_depth": 2}, 2, 64)
+    assert not image.any()
