@@ -125,7 +125,7 @@ PROBLEMS = (
     Problem("ball_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
     Problem("spot_shadow", "blocker.vertex_positions", 0.003, direction=X, slow=True),
     Problem("tube_shadow", "blocker.to_world", 0.004, direction=X, slow=True),
-    Problem("curve_shadow", "blocker.control_points", 0.004, direction=Y, load=GAUSSIAN),
+    Problem("curve_shadow", "blocker.control_points", 0.004, direction=Y, load=GAUSSIAN, slow=True),
     Problem("curve_shadow", "blocker.control_points", 0.004, direction=X, load=DEPTH_3, tag="indirect", slow=True),
     Problem("curve_shadow", "blocker.control_points", 0.004, index=10, load=DEPTH_3, tag="bent", slow=True),
     Problem("curve_shadow", "blocker.control_points", 0.004, index=7, load=GAUSSIAN, tag="swollen", slow=True),

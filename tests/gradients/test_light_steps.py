@@ -82,7 +82,7 @@ def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int
     pytest.param(lambda: projector(picture()), "light.to_world", MOVED, id="texels-moved", marks=slow),
     pytest.param(lambda: projector(picture(7, 4)), "light.to_world", TURNED, id="texels-turned", marks=slow),
     pytest.param(lambda: projector(picture(nearest=False)), "floor.to_world", RAISED, id="smooth-picture", marks=slow),
-    pytest.param(spot, "light.to_world", MOVED, id="spot-moved"),
+    pytest.param(spot, "light.to_world", MOVED, id="spot-moved", marks=slow),
     pytest.param(spot, "light.to_world", TURNED, id="spot-turned", marks=slow),
     pytest.param(spot, "floor.to_world", RAISED, id="spot-floor-raised", marks=slow),
     pytest.param(spot, "camera.to_world", MOVED, id="spot-camera-moved", marks=slow),

@@ -154,7 +154,8 @@ def test_other_sensors(llvm, case, sensor):
     assert_grad_close(*mirrored(case, WIDTH, 128, **SENSORS[sensor]))
 
 
-@pytest.mark.parametrize("what", ["mirror", pytest.param("ball", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["mirror", "ball"])
 def test_what_moves_together_stands_still(llvm, what):
     names = ["card", "camera", "mirror" if what == "mirror" else "glass"]
     scene = mi.load_dict(in_mirror(), optimize=False) if what == "mirror" else behind_glass(ball())
@@ -205,6 +206,7 @@ def smooth_ball() -> mi.Mesh:
     return shape
 
 
+@pytest.mark.slow
 def test_a_slab_that_slides_in_its_plane(llvm):
     """Nothing changes; what it does when it turns shows that it is seen."""
     scene = behind_glass(slab())
