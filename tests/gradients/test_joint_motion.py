@@ -54,7 +54,7 @@ def blocks(images: np.ndarray) -> np.ndarray:
     return images.reshape(n, h // BLOCK, BLOCK, w // BLOCK, BLOCK, c).mean((2, 4))
 
 
-SLOW = ("sunk-ball", "sunk", "ball-shadow", "mesh-shadow", "sky")  # many kernels to compile
+SLOW = ("lamp", "sunk-ball", "sunk", "ball-shadow", "mesh-shadow", "sky")  # many kernels to compile
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

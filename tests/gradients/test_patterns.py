@@ -84,7 +84,7 @@ def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int
 
 
 @pytest.mark.parametrize("texture, param, how", [
-    pytest.param(checkerboard, "thing.to_world", MOVED, id="checkerboard-moved"),
+    pytest.param(checkerboard, "thing.to_world", MOVED, id="checkerboard-moved", marks=slow),
     pytest.param(checkerboard, "thing.to_world", TURNED, id="checkerboard-turned", marks=slow),
     pytest.param(checkerboard, "camera.to_world", {"rotate": (0, 0, 1)}, id="checkerboard-camera-turned", marks=slow),
     pytest.param(checkerboard, "camera.x_fov", {"direction": 5.0}, id="checkerboard-zoomed", marks=slow),

@@ -82,7 +82,8 @@ def spec(depth: int, **budgets) -> dict:
 @pytest.mark.parametrize(
     "bsdf, plugin, param, how, step",
     [
-        ({"type": "conductor"}, "rectangle", "glass.to_world", {"rotate": TURN}, SMALL_TURN),
+        pytest.param({"type": "conductor"}, "rectangle", "glass.to_world", {"rotate": TURN}, SMALL_TURN,
+                     marks=pytest.mark.slow),
         pytest.param(DIELECTRIC, "sphere", "glass.to_world", {"direction": SHIFT}, STEP, marks=pytest.mark.slow),
         pytest.param(DIELECTRIC, "cube", "glass.vertex_positions", {"rotate": TURN}, SMALL_TURN,
                      marks=pytest.mark.slow),
@@ -107,7 +108,9 @@ def test_what_is_not_there_casts_no_shadow(llvm):
     assert_grad_close(-indirect, direct, max_stderr=0.03)
 
 
-@pytest.mark.parametrize("bsdf, plugin", [(DIELECTRIC, "sphere"), pytest.param(PLASTIC, "rectangle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "bsdf, plugin", [(DIELECTRIC, "sphere"), pytest.param(PLASTIC, "rectangle", marks=pytest.mark.slow)]
+)
 def test_forward_and_backward_agree(llvm, bsdf, plugin):
     integrator = integrator_specs.build(spec(4, sppc=16, sppp=16, sppd=16, sppi=64))
     wJv, JTwv, w, Jv = adjoint_identity(pane(bsdf, plugin), "glass.to_world", integrator)
