@@ -9,7 +9,7 @@ do: slide along the ray (`spatial.py`), stay on the material (`material.py`), or
 sweeps carry the derivatives of both, and know nothing else about it.
 
 Where a direction was drawn from a smooth density, its d_k is a constant: the flow keeps the sample. At a specular
-vertex d_k would follow from the arrival, and the same sweeps then carry it.
+vertex d_k follows from the arrival (spatial flow), and the same sweeps carry it.
 
 Emission is in *material* form wherever geometry moves, whether the emitter point y was found by emitter or by BSDF
 sampling (both MIS partners estimate one integral, so they must move y alike):
@@ -49,7 +49,7 @@ class SceneTraits:
     """Which code paths a scene needs at all (fixed while tracing)."""
 
     delta_emitters: bool
-    delta_lobes: bool  # only together with static geometry, see `scene.checks`
+    delta_lobes: bool  # where geometry moves, only the spatial flow follows them
     smooth_lights: bool  # smooth-shaded area lights, see `next_event`
     tubes: Tubes | None = None  # curves
 

@@ -13,12 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import (
-    ANALYTIC_SHAPES,
-    CURVE_SHAPES,
-    INSTANCING,
-    UNSUPPORTED_SHAPES,
-)
+from .capabilities import ANALYTIC_SHAPES, CURVE_SHAPES, INSTANCING, UNSUPPORTED_SHAPES
 from .delta_lobes import blends_delta, delta_lobes, lobes_not_followed, weights_of_delta_lobes
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
