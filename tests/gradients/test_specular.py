@@ -123,4 +123,4 @@ def test_forward_and_backward_agree(llvm, bsdf, plugin):
 def test_edges_before_and_behind(llvm, bsdf, param):
     motion = perturb(pane(bsdf), f"{param}.to_world", direction=SHIFT)
     reference = fd(motion, spec(4), STEP, 4 * SEEDS, 4096)
-    assert_grad_close(forward(motion, spec(4), 2 * SEEDS, 2048), reference, max_stderr=0.02)
+    assert_grad_close(forward(motion, spec(4), 2 * SEEDS, 2048), reference, max_stderr=0.035)
