@@ -182,3 +182,22 @@ def adjoint_identity(scene: mi.Scene, name: str, integrator, spp: int = 4, seed:
     integrator.render_backward(scene, leaves.params, mi.TensorXf(w), seed=seed, spp=spp)
     JTw = dr.grad(leaf)
     return dot64(w, Jv), dot64(JTw, leaves.tangent(leaf)), float(np.linalg.norm(w)), float(np.linalg.norm(Jv))
+
+
+# ------------------------------------------------------------------------------------------ kernels
+
+
+def kernels_compiled(motion: Perturbation, integrator, calls: int = 8, spp: int = 16) -> list[int]:
+    """How many kernels each of so many forward calls, with seeds of their own, met for the first time."""
+    compiled, known = [], set()
+    for seed in range(calls):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            motion.attach()
+            dr.eval(integrator.render_forward(motion.scene, motion.params, seed=seed, spp=spp))
+            dr.sync_thread()
+            found = {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
+            compiled.append(len(found - known))
+            known |= found
+    motion.restore()
+    return compiled

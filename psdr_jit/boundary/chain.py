@@ -179,7 +179,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 continue
             steps, chain = found
             λ = share * _adjoint(job, steps, grad_in)
-            λ = dr.select(dr.isfinite(λ), λ, 0)
+            λ = job.call.counters.rejected.keep_finite(mi.Color1f(λ)).x
             o, d = mi.Point3f(steps.curve.line.o), mi.Vector3f(steps.curve.line.d)
             with job.motion.attached(o, d) as moving:
                 accumulate(λ * steps.curve.attached_F(o, d, moving, _smooth(part)))
@@ -206,7 +206,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Something must be seen through a delta lobe, and move."""
     if steps_rest(facts):
         return False, steps_rest(facts)
-    if not any(s.delta_lobes for s in facts.shapes):
+    if not facts.has_delta_lobes:
         return False, "no surface is a mirror, smooth glass or a window: everything is seen directly"
     if not (facts.shapes_move or facts.camera_moves):
         return False, "only lights without a shape move: every outline stays where it is on the film"

@@ -67,17 +67,17 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
     by_depth, final = _both_sides(job, table, dr.gather(EdgeView, view, kept), longest_path(job) + 1)
     needed = dr.gather(mi.Bool, useful, lane)
     slot = 2 * dr.gather(mi.UInt32, slot, lane)
-    minus, plus = (
-        by_depth.up_to(left, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed)) for side in (0, 1)
-    )
-    if records.delta is not None:
-        emission = [
-            by_depth.up_to(mi.UInt32(0) + 0 * left, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed))
-            for side in (0, 1)
-        ]
-        smooth = needed & ~records.by_delta_lobe()
-        minus, plus = (dr.select(smooth, L - e, L) for L, e in zip((minus, plus), emission, strict=True))
-    return dr.select(needed, minus - plus, 0)
+
+    def step(k: mi.UInt32) -> mi.Spectrum:
+        minus, plus = (
+            by_depth.up_to(k, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed)) for side in (0, 1)
+        )
+        return minus - plus
+
+    found = step(left)
+    if records.delta is not None:  # what the first vertex emits is seen by delta lobes alone
+        found -= records.left_by_smooth_lobes(step(0 * left))
+    return dr.select(needed, found, 0)
 
 
 def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):

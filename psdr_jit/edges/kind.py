@@ -22,7 +22,8 @@ from typing import ClassVar, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame
+from ..core.sensor_frame import SensorFrame, viewpoint
+from .film_cover import LENS_CENTRE, outline_cover
 from .lights import LightBounds
 from .location import EdgeLocation
 from .wedges import Wedges
@@ -217,6 +218,17 @@ class ContourKind(EdgeKind):
     def shades(self, row: mi.UInt32, on: OnEdge, ω: mi.Vector3f, active: mi.Bool) -> mi.Bool | bool:
         """Do rays along ω, towards a light, notice the surface there? Mitsuba shows some surfaces from outside only."""
         return True
+
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        """That of the arc through three points of each row."""
+        row = dr.arange(mi.UInt32, self.count)
+        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
+        on = [self.on(row, mi.Float(t), eye, mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
+        return outline_cover(frame, border, [point.x for point in on])
+
+    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
+        """Where the outline is depends on the light: nothing is ruled out."""
+        return dr.full(mi.Bool, True, self.count)
 
     def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
         """The direction first: parallel lines touch a surface along one contour."""

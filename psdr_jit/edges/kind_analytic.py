@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame, viewpoint
 from .curves import (
     PIECES,
     CurveRows,
@@ -22,9 +21,7 @@ from .curves import (
     transform_point,
     transform_vector,
 )
-from .film_cover import LENS_CENTRE, outline_cover
 from .kind import ContourKind, OnEdge, Side, Sight, Use
-from .lights import LightBounds
 from .location import EdgeLocation
 from .points import INSET, VISIBILITY_EPSILON, clearance
 
@@ -47,17 +44,8 @@ class AnalyticCurves(ContourKind):
     def places(self) -> mi.Point3f:
         return mi.Point3f(dr.detach(attached_to_world(self.curves.shapes, self.curves.rows.shape)[3]))
 
-    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
-        row = dr.arange(mi.UInt32, self.count)
-        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        on = [self.on(row, mi.Float(t), eye, mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
-        return outline_cover(frame, border, [point.x for point in on])
-
     def line_weights(self, use: Use) -> mi.Float:
         return curve_lengths(self.curves) * dr.pi
-
-    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
-        return dr.full(mi.Bool, True, self.count)
 
     def _columns(self, row: mi.UInt32, active: mi.Bool) -> tuple[CurveRows, tuple[mi.Vector3f, ...]]:
         """The rows, and the columns of their shapes' object-to-world maps, detached."""

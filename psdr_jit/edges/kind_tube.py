@@ -11,13 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.sensor_frame import SensorFrame, viewpoint
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
 from ..scene.tubes import Tubes
-from .film_cover import LENS_CENTRE, outline_cover
 from .kind import ContourKind, OnEdge, Side, Sight, Use
-from .lights import LightBounds
 from .location import EdgeLocation
 from .points import INSET, clearance
 
@@ -95,19 +92,10 @@ class TubeOutlines(ContourKind):
         rows = dr.gather(TubeRows, self.rows, row, active)
         return mi.Point3f(dr.detach(self._axis(rows, mi.Float(0.5), active)[0].c))
 
-    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
-        row = dr.arange(mi.UInt32, self.count)
-        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        on = [self.on(row, mi.Float(t), eye, mi.Bool(True)) for t in (0.0, 0.5, 1.0)]
-        return outline_cover(frame, border, [point.x for point in on])
-
     def line_weights(self, use: Use) -> mi.Float:
         a, b = (self._axis(self.rows, mi.Float(t), mi.Bool(True))[0] for t in (0.0, 1.0))
         rim = dr.two_pi * a.r * self.rows.length
         return dr.detach(dr.select(self.rows.side != 0, dr.norm(b.c - a.c), rim) * dr.pi)
-
-    def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
-        return dr.full(mi.Bool, True, self.count)
 
     def _outline(self, rows: TubeRows, t: mi.Float, view: mi.Vector4f, active: mi.Bool):
         """`(axis, ρ, valid)` of a point of an outline."""

@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import warnings
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, fd, forward
+from helpers import adjoint_identity, fd, forward, kernels_compiled
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
@@ -212,15 +211,5 @@ def test_later_calls_compile_nothing(llvm):
     scene = scene_of(painted(texels(40, 50)))
     motion = perturb(scene, "thing.to_world", **MOVED)
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": "spatial"})
-    compiled, known = [], set()
-    for seed in range(8):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            motion.attach()
-            dr.eval(integrator.render_forward(scene, motion.params, seed=seed, spp=16))
-            dr.sync_thread()
-            found = {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
-            compiled.append(len(found - known))
-            known |= found
-    motion.restore()
+    compiled = kernels_compiled(motion, integrator)
     assert compiled[0] > 0 and not any(compiled[4:]), compiled
