@@ -74,9 +74,8 @@ class PatchOnFilm:
     def of(corners: list[mi.Point3f], frame: SensorFrame) -> PatchOnFilm:
         seen = [look_at(frame, x, mi.Point2f(LENS_CENTRE)).p for x in corners]
         depth = [(frame.to_local @ x).z for x in corners]
-        (lower, upper), (nearest, farthest) = (
-            (f(f(v[0], v[1]), v[2]) for f in (dr.minimum, dr.maximum)) for v in (seen, depth)
-        )
+        lower, nearest = (dr.minimum(dr.minimum(v[0], v[1]), v[2]) for v in (seen, depth))
+        upper, farthest = (dr.maximum(dr.maximum(v[0], v[1]), v[2]) for v in (seen, depth))
         reach = dr.maximum(lens_reach(frame, nearest), lens_reach(frame, farthest))
         return PatchOnFilm(mi.Point2f(lower), mi.Point2f(upper), nearest, farthest, reach)
 

@@ -9,7 +9,7 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, fd, forward, kernels_compiled
+from helpers import adjoint_identity, assert_grad_close, fd, forward, kernels_compiled
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
@@ -80,6 +80,26 @@ def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int
         slope = gain(forward(motion, spec, seeds, spp), reference[0::2], reference[1::2])
     assert slope.stderr < MAX_STDERR, slope
     assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope
+
+
+def test_a_crop_window_sees_the_same_steps(llvm):
+    """The camera is farther away than the film has pixels: depths must not be taken for places on the film."""
+    scenes = (mi.load_dict(crop_scene(crop), optimize=False) for crop in ({}, CROP))
+    spec = {"type": "psdr_path", "max_depth": 1}
+    whole, part = (forward(perturb(scene, "thing.to_world", **MOVED), spec, 8, 64) for scene in scenes)
+    x, y = CROP["crop_offset_x"], CROP["crop_offset_y"]
+    assert_grad_close(part, whole[:, y : y + CROP["crop_height"], x : x + CROP["crop_width"]])
+
+
+CROP = {"crop_offset_x": 2, "crop_offset_y": 6, "crop_width": 5, "crop_height": 4}
+
+
+def crop_scene(crop: dict) -> dict:
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}, **crop}
+    pose = mi.ScalarTransform4f().look_at(origin=[0.3, -3, 2.5], target=[0, 0, 0], up=[0, 0, 1])
+    floor = {"type": "rectangle", "emitter": {"type": "area", "radiance": checkerboard(12)}}
+    camera = {"type": "perspective", "fov": 30, "to_world": pose, "film": film}
+    return {"type": "scene", "thing": floor, "camera": camera}
 
 
 @pytest.mark.parametrize("texture, param, how", [
