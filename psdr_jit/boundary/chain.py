@@ -2,25 +2,28 @@
 
 In a mirror or behind glass an edge cannot be connected to the sensor: no closed form says where on the film it is seen.
 The film is searched instead. Along a horizontal or vertical line X on it the view steps where two neighbouring camera
-rays, followed through their chains, end on different surfaces (`chain_search`). The curve that is crossed there
-(`chain_outline`) is met by the chain's last ray where F(X, θ) = 0, so the crossing moves by Ẋ = −F_θ/F_X, and the
-derivative of the image receives
+rays, followed along their paths, part (`chain_search`). The curve that is crossed there (`chain_outline`) is met by the
+last line of sight where F(X, θ) = 0, so the crossing moves by Ẋ = −F_θ/F_X, and the derivative of the image receives
 
     h(p) · (L_a − L_b) · Ẋ / (lines per pixel),        a before b along the line,
 
-with radiances L that are traced with common random numbers, times the throughput of the chain. A line along the curve
+with radiances L that are traced with common random numbers, times the throughput of the path. A line along the curve
 would make 1/F_X blow up: with lines in both directions and the weights F_x²/(F_x² + F_y²) and F_y²/(F_x² + F_y²) what
-is left is −F_θ F_X/(F_x² + F_y²). F_x, F_y and F_θ are derivatives of one attached chain (`chain_sweeps`); the sensor
-is attached as well. No virtual camera, no root search, no count of solutions: as the chain begins at the film, all of
-that is settled by tracing it. Steps of the first segment belong to `primary`.
+is left is −F_θ F_X/(F_x² + F_y²). F_x, F_y and F_θ are derivatives of one attached path (`chain_sweeps`); the sensor
+is attached as well. No virtual camera, no root search, no count of solutions: as the path begins at the film, all of
+that is settled by tracing it. Steps of the first segment belong to `primary`, and paths that leave their first vertex
+by a smooth lobe to the other terms.
 
-Seen are outlines, creases, curves along which surfaces cut, and shading outlines. Left out are patterns on surfaces,
-and what is seen by more than `chain_trace.CHAIN_DEPTH` segments.
+Behind the first vertex any segment may step: what a mirror shows, the shadow on it (a shadow ray towards a point of
+light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
+vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
+outlines, creases, curves along which surfaces cut, shading outlines and patterns. Left out is what lies behind more
+than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -28,27 +31,30 @@ import mitsuba as mi
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
 from ..core.low_discrepancy import lane_sampler
+from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..options import Options
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
-from ..plan.motion import Motion
+from ..plan.motion import Displacements, Motion
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
+from .chain_fixed import Directions, LightPoint
 from .chain_outline import AnalyticShapes, Curve, crossed_curve
+from .chain_patterns import INSET
 from .chain_search import Lines, find_crossings
 from .chain_sweeps import AtRest, carry_adjoints, carry_tangents
-from .chain_trace import ChainRecords, Pair
+from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
 NAME = "chain"
 
 #: Largest distance on the film from a crossing to the curve that it is thought to belong to [px]: halving ends closer.
 MOST_OFF = 0.02
 
-#: Memory of one line: an interval, its comparison and its share of what is found.
-BYTES = 256
+#: Memory of one line: an interval, its comparison, its share of what is found, and its directions.
+BYTES = 256 + CHAIN_DEPTH * Directions.BYTES
 
 
 @dataclass
@@ -58,11 +64,41 @@ class Steps:
     p: mi.Point2f  # film position [px]
     film: mi.Point2f  # the same in [0, 1]² of the crop window
     aperture: mi.Point2f
-    k: mi.UInt32  # segment that parts
-    curve: Curve
+    end: End
     value: mi.Spectrum  # contribution per unit of F_θ
     wavelengths: mi.Color0f
     valid: mi.Bool
+
+
+@dataclass
+class End:
+    """The last line of sight of chains, which the crossed curve is on. Detached."""
+
+    segment: mi.UInt32  # its number
+    curve: Curve
+    in_light: mi.Bool  # it is a shadow ray
+    light: LightPoint
+    source: Hit  # of a shadow ray that is not blocked: its end on an area light
+    distance: mi.Float  # of the light; infinite for directions
+
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, facts: SceneFacts) -> mi.Float:
+        """F of the attached line of sight; a shadow ray follows its ends, in place of the direction `d`."""
+        line = self.curve.line
+        moved = dr.select(self.in_light, moving.of_surface(self.source), 0)
+        turned = mi.Vector3f(0)
+        if facts.has_delta_emitters:
+            it = dr.zeros(mi.Interaction3f)
+            it.p = line.o
+            delta = self.in_light & mi.has_flag(self.light.pointer().flags(), mi.EmitterFlags.Delta)
+            of_place, of_direction = moving.of_light(self.light.pointer(), it, delta)
+            moved = dr.select(delta, of_place, moved)
+            turned = dr.select(delta, of_direction, 0)
+        near = dr.isfinite(self.distance)
+        r = dr.select(near, self.distance, 1)
+        aimed = line.d + dr.select(near, (moved - (o - dr.detach(o))) / r, turned)
+        d = dr.select(self.in_light, dr.normalize(aimed), d)
+        on_surface = any(s.smooth or s.patterns for s in facts.shapes)
+        return self.curve.attached_F(o, d, moving, on_surface)
 
 
 def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
@@ -75,12 +111,41 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), i)
     ray = mi.Ray3f(hit.o, hit.d, 0, dr.gather(type(wavelengths), wavelengths, i))
     limits = job.limits.beyond(of.k)
-    L, _, _ = walk(job.scene, rng, ray, hit.intersection(), limits, NoSink(), mi.Bool(True), mi.Bool(True))
+    L, _, _ = walk(job.scene, rng, ray, hit.intersection(), limits, NoSink(), of.emits, ~of.in_light)
     L = L * β
     dr.eval(L)
     even = 2 * dr.arange(mi.UInt32, n)
     step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
     return job.call.counters.rejected.keep_finite(step)
+
+
+def _beside_line(job: Job, pair: Pair, curve: Curve) -> Pair:
+    """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
+    ray = mi.Ray3f(pair.a.o, pair.a.d)
+    si = pair.a.intersection().compute_surface_interaction(ray, mi.RayFlags.All, curve.pattern)
+    across = curve.g * (INSET / dr.squared_norm(curve.g))
+    step = si.dp_du * across.x + si.dp_dv * across.y
+    crossed = curve.pattern & dr.all(dr.isfinite(step))
+
+    def moved(hit: Hit, side: mi.Float) -> Hit:
+        # From half of the way: beside its start there may be the surface that it has left.
+        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + side * step, hit.d)
+        there = Hit.of(ray, job.scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
+        return dr.select(crossed & (there.shape == hit.shape), there, hit)
+
+    return replace(pair, a=moved(pair.a, curve.side), b=moved(pair.b, -curve.side))
+
+
+def _light_step(job: Job, pair: Pair, chain: ChainRecords, wavelengths) -> tuple[mi.Spectrum, Hit, mi.Float]:
+    """Of shadow rays: `(L_a − L_b times the path's throughput, the one that is not blocked, its length)`."""
+    hit = chain.segment(pair.k, pair.in_light)
+    ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
+    source = dr.select(pair.seen, pair.a, pair.b)
+    value = pair.light.scattered(si, source, pair.in_light) * dr.select(pair.seen, 1, -1) * pair.β_a
+    infinite = mi.has_flag(pair.light.pointer().flags(), mi.EmitterFlags.Infinite)
+    distance = dr.select(infinite, dr.inf, pair.light.towards(si, pair.in_light)[0].dist)
+    return job.call.counters.rejected.keep_finite(dr.select(pair.in_light, value, 0)), source, distance
 
 
 def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
@@ -92,24 +157,28 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     chain = ChainRecords(dr.width(found.k), lines.world.depth)
     pair = lines.compare(found.at, chain)
     dr.eval(pair, chain.hits)
-    curve = crossed_curve(AnalyticShapes.of(job), pair)
+    curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
     dr.eval(curve)
     line = lines.line(found.at.sample)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
-    ΔL = _radiances(job, pair, wavelengths) * weight
+    lit, source, distance = _light_step(job, pair, chain, wavelengths)
+    if lines.world.patterns is not None:
+        pair = _beside_line(job, pair, curve)
+    ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
+    end = End(pair.last, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
-    F_x, F_y = (_film_slope(lines, chain, pair, curve, (p, line, axis)) for axis in (0, 1))
+    F_x, F_y = (_film_slope(lines, chain, end, (p, line, axis)) for axis in (0, 1))
     slope2 = dr.square(F_x) + dr.square(F_y)
     valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
     along = dr.select(line.horizontal, F_x, F_y)
     per_F = dr.select(valid, -along / slope2 * found.at.weight / lines.per_pixel, 0)
-    steps = Steps(p, lines.film(p), line.aperture, pair.k, curve, ΔL * per_F, wavelengths, valid)
+    steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)
     return steps, chain
 
 
-def _film_slope(lines: Lines, chain: ChainRecords, pair: Pair, curve: Curve, at: tuple) -> mi.Float:
+def _film_slope(lines: Lines, chain: ChainRecords, end: End, at: tuple) -> mi.Float:
     """Derivative of F by the film position [m/px], along the axis of `at`: (position, line, axis)."""
     p, line, axis = at
     q = mi.Point2f(p)
@@ -121,23 +190,17 @@ def _film_slope(lines: Lines, chain: ChainRecords, pair: Pair, curve: Curve, at:
         first = chain.segment(mi.UInt32(0), mi.Bool(True))
         start = ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d))
         o_grad, d_grad = tangents(start, ray.d)
-    return _slope(lines.job, chain, (pair.k, curve), (o_grad, d_grad), AtRest(lines.job.sensor))
+    return _slope(lines.job, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
 
 
-def _smooth(job: Job) -> bool:
-    """Is there a shape with interpolated normals?"""
-    return any(s.smooth for s in job.facts.shapes)
-
-
-def _slope(job: Job, chain: ChainRecords, end: tuple, camera: tuple, motion: Motion) -> mi.Float:
-    """Tangent of F at the `end` of chains, (segment, curve), given the tangents `camera` of their first rays."""
-    k, curve = end
-    o_grad, d_grad = carry_tangents(chain, k, *camera, motion)
-    o, d = mi.Point3f(curve.line.o), mi.Vector3f(curve.line.d)
+def _slope(job: Job, chain: ChainRecords, end: End, camera: tuple, motion: Motion) -> mi.Float:
+    """Tangent of F at the `end` of chains, given the tangents `camera` of their first rays."""
+    o_grad, d_grad = carry_tangents(chain, end.segment, *camera, motion)
+    o, d = mi.Point3f(end.curve.line.o), mi.Vector3f(end.curve.line.d)
     with motion.attached(o, d) as moving:
         dr.set_grad(o, o_grad)
         dr.set_grad(d, d_grad)
-        return tangents(curve.attached_F(o, d, moving, _smooth(job)))
+        return tangents(end.attached_F(o, d, moving, job.facts))
 
 
 def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -160,7 +223,7 @@ def forward(job: Job) -> mi.TensorXf:
             if job.facts.camera_moves:
                 with job.motion.attached() as moving:
                     camera = tangents(*_camera(moving, steps, chain))
-            F_grad = _slope(part, chain, (steps.k, steps.curve), camera, job.motion)
+            F_grad = _slope(part, chain, steps.end, camera, job.motion)
             image += share * _splat(job, steps, job.call.counters.rejected.keep_finite(steps.value * F_grad))
     return image
 
@@ -180,11 +243,12 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             steps, chain = found
             λ = share * _adjoint(job, steps, grad_in)
             λ = job.call.counters.rejected.keep_finite(mi.Color1f(λ)).x
-            o, d = mi.Point3f(steps.curve.line.o), mi.Vector3f(steps.curve.line.d)
+            line = steps.end.curve.line
+            o, d = mi.Point3f(line.o), mi.Vector3f(line.d)
             with job.motion.attached(o, d) as moving:
-                accumulate(λ * steps.curve.attached_F(o, d, moving, _smooth(part)))
+                accumulate(λ * steps.end.attached_F(o, d, moving, part.facts))
                 λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
-            λ_o, λ_d = carry_adjoints(chain, steps.k, λ_o, λ_d, job.motion)
+            λ_o, λ_d = carry_adjoints(chain, steps.end.segment, λ_o, λ_d, job.motion)
             if job.facts.camera_moves:
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)
@@ -195,7 +259,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
 def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:
     """Derivative of ⟨grad_in, image⟩ by F_θ of every crossing."""
     with dr.resume_grad():
-        F_grad = dr.zeros(mi.Float, dr.width(steps.k))
+        F_grad = dr.zeros(mi.Float, dr.width(steps.end.segment))
         dr.enable_grad(F_grad)
     with dr.resume_grad(F_grad):
         backpropagate(_splat(job, steps, steps.value * F_grad), grad_in)
@@ -208,8 +272,6 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, steps_rest(facts)
     if not facts.has_delta_lobes:
         return False, "no surface is a mirror, smooth glass or a window: everything is seen directly"
-    if not (facts.shapes_move or facts.camera_moves):
-        return False, "only lights without a shape move: every outline stays where it is on the film"
     if options.depth_limit < 2:
         return False, f"max_depth = {options.max_depth}: nothing is seen through mirrors and glass"
     return True, "outlines move in mirrors and behind glass"
@@ -223,7 +285,7 @@ def cost(form: str, sky: bool) -> float:
 TERM = Term(
     name=NAME,
     budget="spps",
-    streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE),
+    streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_GUIDE, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE),
     needed=needed,
     cost=cost,
     forward=forward,

@@ -27,6 +27,7 @@ from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transf
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..plan.probe_motion import registry_table
+from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
@@ -54,6 +55,9 @@ class Curve:
 
     line: Hit  # the line of sight, and what it meets
     shading: mi.Bool  # F = n·d
+    pattern: mi.Bool  # F = g·(u, v), up to a constant
+    g: mi.Vector2f
+    side: mi.Float  # sign of F on the first chain's side of a pattern's line
     m1: Hit
     m2: Hit
     c1: mi.Vector3f
@@ -62,15 +66,19 @@ class Curve:
     F: mi.Float  # where the chain was traced [m]
     valid: mi.Bool
 
-    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, smooth: bool) -> mi.Float:
-        """F of the attached line of sight (o, d) and of what moves. `smooth`: there may be shading outlines."""
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, on_surface: bool) -> mi.Float:
+        """F of the attached line of sight (o, d) and of what moves.
+
+        `on_surface`: there may be shading outlines and patterns.
+        """
         F = dr.dot(self.c1 + self.c2, o + self.t * d)
         F -= dr.dot(self.c1, moving.of_surface(self.m1)) + dr.dot(self.c2, moving.of_surface(self.m2))
-        if not smooth:
+        if not on_surface:
             return F
         si = moving.surface(self.line, mi.Ray3f(o, d), mi.RayFlags.All)
         n = dr.select(self.shading, mi.Vector3f(si.sh_frame.n), 0)
-        return dr.select(self.shading, dr.dot(n, d), F)
+        F = dr.select(self.shading, dr.dot(n, d), F)
+        return dr.select(self.pattern, dr.dot(self.g, si.uv), F)
 
 
 @dataclass(frozen=True)
@@ -159,7 +167,7 @@ def _interaction(hit: Hit) -> mi.SurfaceInteraction3f:
     return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.All)
 
 
-def crossed_curve(shapes: AnalyticShapes | None, pair: Pair) -> Curve:
+def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None, pair: Pair) -> Curve:
     """The curve between the ends of the two chains, for the line of sight of the first."""
     line = mi.Ray3f(pair.a.o, pair.a.d)
     first = pair.a.intersection().t <= pair.b.intersection().t
@@ -181,9 +189,17 @@ def crossed_curve(shapes: AnalyticShapes | None, pair: Pair) -> Curve:
     h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
     shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)
     F = dr.select(shading, dr.select(first, h_near, h_far), dr.select(cut, F_cut, best.gap))
+    pattern, g, side = mi.Bool(False), mi.Vector2f(0), mi.Float(0)
+    if patterns is not None:
+        pattern = pair.family != NO_FAMILY
+        g, F_line, side = patterns.line(pair.family, _interaction(pair.a), _interaction(pair.b))
+        F, shading = dr.select(pattern, F_line, F), shading & ~pattern
     return Curve(
         line=pair.a,
         shading=shading,
+        pattern=pattern,
+        g=g,
+        side=side,
         m1=dr.select(cut, _resting(near, si_near.p, near.prim_uv), best.m),
         m2=dr.select(cut, _resting(far, si_far.p, far.prim_uv), best.m),
         c1=dr.select(cut, mi.Vector3f(c1 * scale), best.n),

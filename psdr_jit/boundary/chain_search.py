@@ -2,10 +2,10 @@
 
 Every sample is a line across one pixel, horizontal or vertical. A crossing between its ends shows in that their chains
 part (`chain_trace`), and is found by halving. Two crossings may hide each other, so an interval is looked at again:
-where its ends agree, with probability q < 1/2, cut at a random point and with 1/q of its weight; on both sides of a
-crossing always. Every crossing is then found with expected weight 1, however small what it bounds, and the cost is that
-of 1/(1 − 2q) intervals; a small q is cheap, and noisy at corners. Only float32 sets a limit: intervals end at the width
-at which rays can be told apart.
+where its ends agree, with probability q < 1/2, cut at a random point near its middle and with 1/q of its weight; on
+both sides of a crossing always. Every crossing is then found with expected weight 1, however small what it bounds, and
+the cost is that of 1/(1 − 2q) intervals; a small q is cheap, and noisy at corners. Only float32 sets a limit: intervals
+end at the width at which rays can be told apart.
 
 Crossings of the first segment are not kept, only walked around: they belong to the primary boundary.
 """
@@ -25,10 +25,15 @@ from ..core.varying import varying
 from ..paths.rays import skip_emitters
 from ..plan.job import Job
 from ..plan.probe_motion import registry_table
-from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Pair, trace_pair
+from .chain_fixed import Directions
+from .chain_patterns import ChainPatterns
+from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Pair, guide, trace_pair
 
 #: Probability with which an interval is cut though its ends agree: where they see a delta lobe, and elsewhere.
-CUT_SHARE, CUT_SHARE_ELSEWHERE = 0.35, 0.2
+CUT_SHARE, CUT_SHARE_ELSEWHERE = 0.4, 0.2
+
+#: Range of the cut, of the interval: pieces that shrink fast find what is narrow after fewer cuts, with less weight.
+CUT_SPREAD = 0.1
 
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
 LEAST_WIDTH, ROUNDING = 2.0**-18, 5e-7
@@ -76,6 +81,7 @@ class Lines:
     count: int
     pixels: tuple[int, int]
     corner: tuple[float, float]
+    directions: Directions  # of their smooth vertices
 
     @staticmethod
     def of(job: Job) -> Lines:
@@ -83,8 +89,24 @@ class Lines:
         width, height = (int(n) for n in upper - lower)
         flat = {s.index for s in job.facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         depth = min(job.limits.max_depth, CHAIN_DEPTH)
-        world = ChainWorld(job.scene, depth, registry_table(job.scene, flat))
-        return Lines(job, world, width * height * job.spp, (width, height), tuple(map(float, lower)))
+        world = ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job))
+        count = width * height * job.spp
+        directions = Directions(count, depth)
+        lines = Lines(job, world, count, (width, height), tuple(map(float, lower)), directions)
+        lines._guide()
+        dr.eval(directions.data)
+        return lines
+
+    def _guide(self) -> None:
+        """Draw the directions of all lines."""
+        sample = dr.arange(mi.UInt32, self.count)
+        sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
+        ray = self.ray(self.line(sample), sampler.next_1d())
+        guide(self.world, ray, self._numbers(sample), sampler, sample, self.directions)
+
+    def _numbers(self, sample: mi.UInt32):
+        """What chooses lobes and points of light, for all chains of a line."""
+        return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
 
     def line(self, sample: mi.UInt32) -> Line:
         rng = pixel_sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample, self.job.spp)
@@ -116,8 +138,8 @@ class Lines:
     def compare(self, at: Interval, store: ChainRecords | None = None) -> Pair:
         """The chains from both ends of the intervals."""
         line = self.line(at.sample)
-        rng = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), at.sample)
-        return trace_pair(self.world, self.ray(line, at.lo), self.ray(line, at.hi), rng, store, mi.Bool(True))
+        rays = self.ray(line, at.lo), self.ray(line, at.hi)
+        return trace_pair(self.world, rays, self._numbers(at.sample), (self.directions, at.sample), store)
 
     @property
     def least_width(self) -> mi.Float:
@@ -161,7 +183,7 @@ def _cut(lines: Lines, at: Interval, maybe: mi.Bool, specular: mi.Bool) -> Inter
     chosen = compact(weighted, maybe & wide & (_uniform(at.key, 0) < share))
     if chosen is None:
         return None
-    point = dr.lerp(chosen.lo, chosen.hi, _uniform(chosen.key, 1))
+    point = dr.lerp(chosen.lo, chosen.hi, 0.5 + CUT_SPREAD * (_uniform(chosen.key, 1) - 0.5))
     return _sides(chosen, point, point, chosen.weight)
 
 

@@ -39,11 +39,14 @@ class AtRest(Motion):
         return mi.Vector3f(0), mi.Vector3f(0)
 
 
-def _onward(hit: Hit, d_next: mi.Vector3f, ray: mi.Ray3f, moving: Displacements, active: mi.Bool):
-    """The attached ray `(x, d)` that leaves the surface at the end of `hit` in the direction `d_next`."""
+def _onward(hit: Hit, d_next: mi.Vector3f, ray: mi.Ray3f, moving: Displacements, bends: mi.Bool):
+    """The attached ray `(x, d)` that leaves the surface at the end of `hit` in the direction `d_next`.
+
+    `bends`: by a delta lobe. At smooth vertices the direction stays what it is.
+    """
     si = moving.surface(hit, ray, mi.RayFlags.All)
-    step = delta_step(mi.BSDFContext(), si, si.bsdf(), d_next, active)
-    return si.p, step.d
+    step = delta_step(mi.BSDFContext(), si, si.bsdf(), d_next, bends)
+    return si.p, dr.select(bends, step.d, d_next)
 
 
 @dr.syntax
@@ -53,12 +56,12 @@ def carry_tangents(chain: ChainRecords, last: mi.UInt32, o_grad: mi.Vector3f, d_
     o_grad, d_grad = mi.Vector3f(o_grad), mi.Vector3f(d_grad)
     active = k < last
     while dr.hint(active, label="psdr.chain.forward", exclude=[chain, motion]):
-        hit, d_next = chain.segment(k, active), chain.segment(k + 1, active).d
+        hit, d_next, bends = chain.segment(k, active), chain.segment(k + 1, active).d, chain.bent(k, active)
         o, d = mi.Point3f(hit.o), mi.Vector3f(hit.d)
         with motion.attached(o, d) as moving:
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, bends)
             x_grad, onward_grad = tangents(x, onward)
         o_grad, d_grad = mi.Vector3f(x_grad), mi.Vector3f(onward_grad)
         k += 1
@@ -74,10 +77,10 @@ def carry_adjoints(chain: ChainRecords, last: mi.UInt32, λ_o: mi.Vector3f, λ_d
     active = k > 0
     while dr.hint(active, label="psdr.chain.backward", exclude=[chain, motion]):
         k -= 1
-        hit, d_next = chain.segment(k, active), chain.segment(k + 1, active).d
+        hit, d_next, bends = chain.segment(k, active), chain.segment(k + 1, active).d, chain.bent(k, active)
         o, d = mi.Point3f(hit.o), mi.Vector3f(hit.d)
         with motion.attached(o, d) as moving:
-            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, active)
+            x, onward = _onward(hit, d_next, mi.Ray3f(o, d), moving, bends)
             dr.backward_from(dr.dot(λ_o, x) + dr.dot(λ_d, onward))
             λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
         active = k > 0

@@ -1,10 +1,10 @@
-"""Two neighbouring camera rays and the chains of delta vertices that they follow: where do they first part?
+"""Two neighbouring camera rays and the paths that they follow: where do they first part?
 
-A chain goes on from a surface by one of its delta lobes and ends where there is none. Which lobe is a matter of random
-numbers alone, the same for both chains and with the same probability wherever they are on a surface: nothing steps
-because of the choice, and a chain's throughput is the product of the lobes' values over these probabilities. A surface
-that also scatters smoothly (plastic) ends no chain. Total reflection leaves the transmitted lobe without a direction;
-its value has gone to 0 before, so that a chain may end there without a step.
+A path leaves its first vertex by a delta lobe, and every other one by a delta lobe or in the direction that its line
+keeps for it (`chain_fixed`). Which lobe is a matter of random numbers alone, the same for both paths and with the same
+probability wherever they are on a surface: nothing steps because of the choice, and a path's throughput is the product
+of the lobes' values over these probabilities. Total reflection leaves the transmitted lobe without a direction; its
+value has gone to 0 before, so that a path may end there without a step.
 
 Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
 shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
@@ -23,12 +23,17 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..core.varying import varying
 from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
+from .chain_fixed import Direction, Directions, LightPoint, draw_direction, draw_light
+from .chain_patterns import NO_FAMILY, ChainPatterns
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
 CHAIN_DEPTH = 8
 
 #: Share of the chains that are reflected where a surface reflects and lets through.
 REFLECTED_SHARE = 1 / 3
+
+#: Share of the chains that go on by a smooth lobe where a surface has both kinds.
+SMOOTH_SHARE = 0.5
 
 #: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
 COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
@@ -45,6 +50,7 @@ class ChainWorld:
     scene: mi.Scene
     depth: int  # largest number of segments
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
+    patterns: ChainPatterns | None  # None: no surface steps inside
 
 
 @dataclass
@@ -54,10 +60,27 @@ class Pair:
     k: mi.UInt32  # number of the segment, 0: from the sensor
     differs: mi.Bool
     specular: mi.Bool  # some vertex on the way, or where they part, has a delta lobe
-    a: Hit  # segment k of each
+    emits: mi.Bool  # does what segment k ends at count with its emission?
+    in_light: mi.Bool  # they part in what they see of `light` from the end of segment k, which they share
+    seen: mi.Bool  # it is the first that sees it
+    family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
+    light: LightPoint
+    a: Hit  # segment k of each, or the shadow rays from its end
     b: Hit
     β_a: mi.Spectrum  # throughput before it
     β_b: mi.Spectrum
+
+    @staticmethod
+    def start() -> Pair:
+        no, hit = mi.Bool(False), Hit.made(dr.zeros, 1)
+        light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
+        k, family, β = mi.UInt32(0), mi.UInt32(NO_FAMILY), mi.Spectrum(1)
+        return Pair(k, no, no, mi.Bool(True), no, no, family, light, hit, hit, β, β)
+
+    @property
+    def last(self) -> mi.UInt32:
+        """Number of the segment whose ends part, shadow rays counted."""
+        return self.k + dr.select(self.in_light, mi.UInt32(1), 0)
 
 
 class ChainRecords:
@@ -66,15 +89,22 @@ class ChainRecords:
     def __init__(self, lanes: int, depth: int):
         self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
-        self.hits = Hit.made(dr.zeros, lanes * depth)
-        dr.make_opaque(self.hits)
+        self.hits = Hit.made(dr.zeros, lanes * (depth + 1))  # behind the last vertex there may be a shadow ray
+        self.bends = dr.zeros(mi.Bool, lanes * (depth + 1))  # is the end of the segment left by a delta lobe?
+        dr.make_opaque(self.hits, self.bends)
 
     def write(self, k: mi.UInt32, hit: Hit, active: mi.Bool) -> None:
         dr.scatter(self.hits, hit, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
+    def write_bend(self, k: mi.UInt32, by_delta: mi.Bool, active: mi.Bool) -> None:
+        dr.scatter(self.bends, by_delta, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
+
     def segment(self, k: mi.UInt32, active: mi.Bool) -> Hit:
         """Segment `k` of every lane."""
         return dr.gather(Hit, self.hits, k * self.stride + self.lane, active)
+
+    def bent(self, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        return dr.gather(mi.Bool, self.bends, k * self.stride + self.lane, active)
 
 
 @dataclass
@@ -84,16 +114,36 @@ class Leaving:
     ray: mi.Ray3f
     factor: mi.Spectrum  # value of the lobe over the probability of its choice
     alive: mi.Bool
+    by_delta: mi.Bool
 
 
 def has_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Does a chain go on there?"""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
 
 
-def leave(si: mi.SurfaceInteraction3f, u: mi.Float, active: mi.Bool) -> Leaving:
-    """Go on by a delta lobe; `u` chooses between the reflected one and the one that leads through."""
+def smooth_choice(bsdf: mi.BSDFPtr, k: mi.UInt32, u: mi.Float) -> tuple[mi.Bool, mi.Float]:
+    """Is vertex `k` left by a smooth lobe, and with which probability was that chosen? The first one never is."""
+    flags = bsdf.flags()
+    smooth, delta = mi.has_flag(flags, mi.BSDFFlags.Smooth) & (k > 0), has_delta(bsdf)
+    chosen = smooth & (~delta | (u < SMOOTH_SHARE))
+    share = dr.select(chosen, mi.Float(SMOOTH_SHARE), 1 - SMOOTH_SHARE)
+    return chosen, dr.select(smooth & delta, share, 1)
+
+
+def leave(si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool) -> Leaving:
+    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses."""
     bsdf = si.bsdf()
+    smooth, share = smooth_choice(bsdf, k, u.x)
+    smooth &= active
+    onward = _delta_leave(si, bsdf, u.y, active & ~smooth)
+    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(fixed.ω), smooth)
+    ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
+    factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
+    return Leaving(ray, factor, (smooth & dr.any(factor != 0)) | onward.alive, onward.alive)
+
+
+def _delta_leave(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, u: mi.Float, active: mi.Bool) -> Leaving:
+    """By the reflected lobe or the one that leads through, as `u` chooses."""
     flags = bsdf.flags()
     reflects = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
     passes = mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission) | mi.has_flag(flags, mi.BSDFFlags.Null)
@@ -107,7 +157,7 @@ def leave(si: mi.SurfaceInteraction3f, u: mi.Float, active: mi.Bool) -> Leaving:
     alive = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0) & (crosses == through)
     null = alive & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     value = dr.select(null, bsdf.eval_null_transmission(si, null), weight * bs.pdf)
-    return Leaving(si.spawn_ray(si.to_world(bs.wo)), dr.select(alive, value / choice, 0), alive)
+    return Leaving(si.spawn_ray(si.to_world(bs.wo)), dr.select(alive, value / choice, 0), alive, alive)
 
 
 def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
@@ -128,16 +178,52 @@ def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) ->
     return same & (~both | dr.select(flat, one_plane & side, one_curve))
 
 
+@dataclass
+class Numbers:
+    """Random numbers of one vertex, the same for all chains of a line."""
+
+    lobe: mi.Point2f
+    emitter: mi.Float
+    light: mi.Point2f
+
+    @staticmethod
+    def draw(rng) -> Numbers:
+        return Numbers(rng.next_2d(), rng.next_1d(), rng.next_2d())
+
+
 @dr.syntax
-def trace_pair(world: ChainWorld, ray_a: mi.Ray3f, ray_b: mi.Ray3f, rng, store: ChainRecords | None, active: mi.Bool):
-    """Follow two chains as long as they meet the same surfaces; `store` keeps the segments of the first."""
-    ray_a, ray_b = mi.Ray3f(ray_a), mi.Ray3f(ray_b)
-    active = mi.Bool(active)
-    pair = Pair(
-        mi.UInt32(0), mi.Bool(False), mi.Bool(False), Hit.made(dr.zeros, 1), Hit.made(dr.zeros, 1),
-        mi.Spectrum(1), mi.Spectrum(1)
-    )  # fmt: skip
-    while dr.hint(active, label="psdr.chain.pair", exclude=[world, store]):
+def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: Directions):
+    """Follow one chain of every line and draw its directions; `rng` as for `trace_pair`. Fills `out`."""
+    ray, k, active = mi.Ray3f(ray), mi.UInt32(0), mi.Bool(True)
+    while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out]):
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        active &= si.is_valid()
+        u = Numbers.draw(rng)
+        smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
+        fixed = draw_direction(si, sampler, smooth & active)
+        out.write(k, line, fixed)
+        onward = leave(si, k, u.lobe, fixed, active)
+        ray, active = onward.ray, onward.alive
+        k += 1
+
+
+@dr.syntax
+def trace_pair(
+    world: ChainWorld,
+    rays: tuple[mi.Ray3f, mi.Ray3f],
+    rng,
+    fixed: tuple[Directions, mi.UInt32],
+    store: ChainRecords | None,
+):
+    """Follow two chains as long as they meet the same surfaces; `store` keeps the segments of the first.
+
+    `fixed`: the directions of all lines, and the number of this one.
+    """
+    ray_a, ray_b = mi.Ray3f(rays[0]), mi.Ray3f(rays[1])
+    directions, line = fixed
+    active, pair = mi.Bool(True), Pair.start()
+    while dr.hint(active, label="psdr.chain.pair", exclude=[world, directions, store]):
         pi_a = world.scene.ray_intersect_preliminary(ray_a, coherent=False, active=active)
         pi_b = world.scene.ray_intersect_preliminary(ray_b, coherent=False, active=active)
         a = pi_a.compute_surface_interaction(ray_a, mi.RayFlags.All)
@@ -146,13 +232,48 @@ def trace_pair(world: ChainWorld, ray_a: mi.Ray3f, ray_b: mi.Ray3f, rng, store: 
         if dr.hint(store is not None, mode="scalar"):
             store.write(pair.k, pair.a, active)
         pair.differs = ~same_surface(world, a, b, ray_a.d, ray_b.d)
+        if dr.hint(world.patterns is not None, mode="scalar"):
+            crossed, family = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
+            pair.differs |= crossed
+            pair.family = dr.select(active, family, pair.family)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
-        u = rng.next_1d()
+        u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
-        on_a, on_b = leave(a, u, active), leave(b, u, active)
+
+        pair = compare_light(world.scene, pair, (a, b), u, active & (pair.k > 0))
+        active &= ~pair.differs
+        direction = directions.read(pair.k, line, active)
+        on_a, on_b = leave(a, pair.k, u.lobe, direction, active), leave(b, pair.k, u.lobe, direction, active)
+        if dr.hint(store is not None, mode="scalar"):
+            store.write_bend(pair.k, on_a.by_delta, active)
         active = on_a.alive & on_b.alive
         pair.k += dr.select(active, mi.UInt32(1), 0)
+        pair.emits = dr.select(active, on_a.by_delta, pair.emits)
         pair.β_a *= dr.select(active, on_a.factor, 1)
         pair.β_b *= dr.select(active, on_b.factor, 1)
         ray_a, ray_b = on_a.ray, on_b.ray
     return pair
+
+
+def compare_light(scene: mi.Scene, pair: Pair, ends: tuple, u: Numbers, active: mi.Bool) -> Pair:
+    """Do the chains see the same of a point of light, from the surface interactions `ends`?"""
+    a, b = ends
+    active = active & mi.has_flag(a.bsdf().flags(), mi.BSDFFlags.Smooth)
+    light = draw_light(scene, u.emitter, u.light, active)
+    hit_a, seen_a = light.seen_from(scene, a, active)
+    hit_b, seen_b = light.seen_from(scene, b, active)
+    parts = active & (seen_a != seen_b)
+    return Pair(
+        k=pair.k,
+        differs=pair.differs | parts,
+        specular=pair.specular,
+        emits=pair.emits,
+        in_light=parts,
+        seen=seen_a,
+        family=pair.family,
+        light=dr.select(parts, light, pair.light),
+        a=dr.select(parts, hit_a, pair.a),
+        b=dr.select(parts, hit_b, pair.b),
+        β_a=pair.β_a,
+        β_b=pair.β_b,
+    )

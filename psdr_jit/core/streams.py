@@ -26,6 +26,7 @@ class Stream(IntEnum):
     CHAIN_LOBES = 12
     CHAIN_CUTS = 13
     CHAIN_RADIANCE = 14
+    CHAIN_GUIDE = 15
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -36,6 +36,8 @@ class _Known:
 
     values: list  # textures and their parameters
     buffers: list  # texture coordinates and faces of a mesh
+    families: list[StepFamily]
+    between_faces: bool
     patterns: ShapePatterns
 
 
@@ -57,7 +59,13 @@ TABLES: Slot[dict[bool, _Table]] = Slot(dict)
 
 def patterns_of(job: Job, chosen: list[ShapeFacts]) -> list[ShapePatterns | None]:
     """The patterns of shapes, None for those without; kept from call to call."""
-    return [_shape_patterns(job, facts) if facts.patterns else None for facts in chosen]
+    return [_shape_patterns(job, facts).patterns if facts.patterns else None for facts in chosen]
+
+
+def steps_of(job: Job, facts: ShapeFacts) -> tuple[list[StepFamily], bool]:
+    """The lines along which a shape with patterns steps, and whether its faces differ; kept from call to call."""
+    known = _shape_patterns(job, facts)
+    return known.families, known.between_faces
 
 
 def pattern_kinds(
@@ -87,22 +95,22 @@ def pattern_kinds(
     return tuple(kinds)
 
 
-def _shape_patterns(job: Job, facts: ShapeFacts) -> ShapePatterns:
+def _shape_patterns(job: Job, facts: ShapeFacts) -> _Known:
     shape, known = edge_shapes(job).shapes[facts.index], job.call.memory[PATTERNS].get(facts.name)
     if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
-        return known.patterns
+        return known
     textures = pattern_textures(shape)
     values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]
     buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
     if known is None or not _unchanged(known, values, buffers):
-        families = _families(textures, shape, facts, job.call.memory)
+        families, between_faces = _families(textures, shape, facts, job.call.memory), steps_between_faces(textures)
         if facts.is_mesh:
-            patterns = mesh_patterns(shape, families, steps_between_faces(textures))
+            patterns = mesh_patterns(shape, families, between_faces)
         else:
             patterns = analytic_patterns(facts.plugin, families)
-        known = _Known(values, buffers, patterns)
+        known = _Known(values, buffers, families, between_faces, patterns)
         job.call.memory[PATTERNS][facts.name] = known
-    return known.patterns
+    return known
 
 
 def _unchanged(known: _Known, values: list, buffers: list) -> bool:

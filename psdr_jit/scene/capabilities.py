@@ -114,9 +114,8 @@ SUPPORT = (
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
-    Row("mirrors, smooth glass and plastic, null, mask", "warning",
-        _MOVING + "edges of shadows, reflections and patterns that the sensor sees in them are missing, outlines are "
-        "there; beside instances and curves: error"),
+    Row("mirrors, smooth glass and plastic, null, mask", "yes",
+        _MOVING + "beside instances and curves: error; seen in them, frames of projectors and hard rims: warning"),
     Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
         "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",

@@ -171,11 +171,11 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} ({lobes}) through which motion is not followed, because {obstacle}; use a rough BSDF (such "
                 "as roughconductor, roughdielectric or roughplastic), or differentiate materials and radiance only",
             )  # fmt: skip
-        else:
+        elif steps := [f"{step} of '{e.name}'" for e in facts.emitters for step in e.steps]:
             yield Finding(
                 UnsupportedWarning, shape.name,
-                f"{label} ({lobes}): the edges of shadows, of reflections and of patterns that the sensor sees by way "
-                "of them are missing from the derivative; outlines are there. Use a rough BSDF where they matter",
+                f"{label} ({lobes}): what the sensor sees by way of them of {', '.join(steps)} is missing from the "
+                "derivative. Use a rough BSDF, or a light without steps, where it matters",
             )  # fmt: skip
 
 

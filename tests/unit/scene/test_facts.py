@@ -281,8 +281,10 @@ def test_specular_lobes(bsdf, lobes):
     for moving in ("floor.to_world", "lamp.position", CAMERA):
         facts = facts_of(load(**scene), moving)
         assert set(named(facts, "ball").delta_lobes) == lobes
-        assert complaints(facts) == ([(UnsupportedWarning, "ball")] if lobes else [])
+        assert complaints(facts) == []
     require_supported(facts_of(load(**scene), NOTHING_MOVES))
+    steps = {"type": "spot", "cutoff_angle": 20, "beam_width": 20}
+    assert complaints(facts_of(load(**scene, spot=steps), CAMERA)) == ([(UnsupportedWarning, "ball")] if lobes else [])
 
 
 @pytest.mark.parametrize(
