@@ -208,7 +208,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, steps_rest(facts)
     if not facts.has_delta_lobes:
         return False, "no surface is a mirror, smooth glass or a window: everything is seen directly"
-    if not (facts.shapes_move or facts.camera_moves):
+    if not (facts.shapes_move or facts.camera_moves or facts.paths_bend):
         return False, "only lights without a shape move: every outline stays where it is on the film"
     if options.depth_limit < 2:
         return False, f"max_depth = {options.max_depth}: nothing is seen through mirrors and glass"

@@ -80,6 +80,9 @@ WEIGHED_PLUGINS = frozenset({
 })  # fmt: skip
 """Materials whose samples tell what their delta lobes are worth, attached to their parameters."""
 
+TWINS = {("dielectric", "eta"): "psdr_dielectric", ("plastic", "eta"): "psdr_plastic"}
+"""(plugin, parameter) that Mitsuba keeps as a plain number: our plugin that is the same otherwise."""
+
 BENDING_PARAMETERS = frozenset({("psdr_dielectric", "eta")})
 """(plugin, parameter): those that turn the direction in which a delta lobe leads."""
 
@@ -127,8 +130,9 @@ SUPPORT = (
     Row("mirrors, smooth glass and plastic, null, mask", "warning",
         _MOVING + "edges of shadows, reflections and patterns that the sensor sees in them are missing, outlines are "
         "there; beside instances and curves: error"),
-    Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
-        "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
+    Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",
+        "IOR: `psdr_dielectric`, `psdr_plastic` in place of `dielectric`, `plastic`, which keep it as a plain number; "
+        "behind glass as in the row above; opacity of a mask, what is under it or a bump map, normals: error"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, face attributes", "yes", "where texture coordinates move: warning"),
