@@ -53,11 +53,21 @@ class DeltaRecords:
         """Attached b·(direction that leaves), the arrival fixed, of every vertex `hit` (flat arrays)."""
         t = self.turns
         active = dr.any(t.b != 0)
-        there = Hit(hit.o + hit.t * hit.d - hit.t * t.ω_in, t.ω_in, hit.t, hit.shape, hit.prim_index, hit.prim_uv)
+        x = hit.o + hit.t * hit.d
+        r = lead(x)
+        there = Hit(x - r * t.ω_in, t.ω_in, r, hit.shape, hit.prim_index, hit.prim_uv)
         there.shape = dr.select(active, hit.shape, 0)
         si = moving.surface(there, mi.Ray3f(there.o, there.d), mi.RayFlags.All)
         step = delta_step(mi.BSDFContext(), si, si.bsdf(), -hit.d, active)
         return dr.select(active, dr.dot(t.b, step.d), 0)
+
+
+def lead(x: mi.Point3f) -> mi.Float:
+    """Distance before the vertex x from which a ray meets nothing else first, as far as ray offsets go [m].
+
+    Mitsuba's spheres and cylinders take the motion of the *first* hit of a ray for that of any.
+    """
+    return mi.math.RayEpsilon * (1 + dr.max(dr.abs(x)))
 
 
 def through_vertex(
@@ -84,8 +94,10 @@ def through_vertex(
         û = mi.Vector3f(0, 0, 0) + dr.zeros(mi.Vector3f, dr.width(b))
         dr.enable_grad(û)
     with dr.resume_grad(û):
-        ray = mi.Ray3f(si.p - pi.t * ω_in + û, ω_in)
-        there = pi.compute_surface_interaction(ray, mi.RayFlags.All, delta)
+        near = mi.PreliminaryIntersection3f(pi)
+        near.t = lead(si.p)
+        ray = mi.Ray3f(si.p - near.t * ω_in + û, ω_in)
+        there = near.compute_surface_interaction(ray, mi.RayFlags.All, delta)
         dr.backward_from(dr.select(delta, dr.dot(b_n, there.sh_frame.n), 0))
         bent = mi.Vector3f(dr.grad(û))
     return dr.select(delta, b_in, 0), dr.select(delta, bent, 0)

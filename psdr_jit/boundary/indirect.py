@@ -119,7 +119,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, f"max_depth = {options.depth_limit}: light is scattered once at most"
     if geometry.lone_convex:
         return False, f"'{geometry.lone_convex}' is alone and convex: it sees nothing but the sky"
-    if not (facts.shapes_move or facts.camera_moves):
+    if not (facts.shapes_move or facts.camera_moves or facts.paths_bend):
         return False, "only lights without a shape move: what surfaces see of each other stays the same"
     return True, "what surfaces see of each other moves"
 

@@ -200,7 +200,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     if steps_rest(facts):
         return False, steps_rest(facts)
     if not (facts.shapes_move or facts.camera_moves):
-        return False, "only lights without a shape move: every outline stays where it is on the film"
+        what = "paths bend behind glass" if facts.paths_bend else "lights without a shape move"
+        return False, f"only {what}: every outline stays where it is on the film"
     return True, "outlines move over the film"
 
 

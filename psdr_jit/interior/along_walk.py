@@ -5,7 +5,8 @@ a path is
 
     dL = Σ_k [ β̇_k L_k + β_k (L̇_e,k + ḟ_k(ω_em) L_em + f_k(ω_em) L̇_em) ],      β̇_{k+1} = β̇_k w_k + β_k ḟ_k(ω_{k+1}) / p
 
-with L_k what vertex k emits and scatters from an emitter sample ω_em. It is `sweeps.forward_sweep` of the resting flow.
+with L_k what vertex k emits and scatters from an emitter sample ω_em; of a delta lobe, f is its value
+(`paths/delta_step.py`) and p its probability. It is `sweeps.forward_sweep` of the resting flow.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.ad import tangents
+from ..paths.delta_step import delta_step
 from ..paths.sink import NoSink, Scatter
 
 
@@ -25,26 +27,30 @@ class MaterialTangents(NoSink):
 
     dL: mi.Spectrum  # derivative of the path's radiance so far
     β_grad: mi.Spectrum  # of the throughput
+    delta_lobes: bool  # whether the scene has any
 
     @classmethod
-    def zero(cls) -> MaterialTangents:
-        return cls(mi.Spectrum(0), mi.Spectrum(0))
+    def zero(cls, delta_lobes: bool) -> MaterialTangents:
+        return cls(mi.Spectrum(0), mi.Spectrum(0), delta_lobes)
 
     def scattered(self, k: mi.UInt32, s: Scatter, active: mi.Bool) -> None:
         """Add what vertex `k` contributes, and carry the throughput's derivative on."""
         ctx = mi.BSDFContext()
         nee, onward = s.nee, s.onward
-        smooth = onward.alive & ~onward.scattering.delta
+        delta = onward.alive & onward.scattering.delta
         with dr.resume_grad():
             f_em = s.bsdf.eval(ctx, s.si, nee.ω, nee.seen)
-            f = s.bsdf.eval(ctx, s.si, onward.scattering.wo, smooth)
+            f = s.bsdf.eval(ctx, s.si, onward.scattering.wo, onward.alive & ~delta)
+            if self.delta_lobes:
+                step = delta_step(ctx, s.si, s.bsdf, s.si.to_world(onward.scattering.wo), delta)
+                f = dr.select(delta, step.value, f)
             f_em_grad, f_grad = tangents(f_em, f)
         from_emitter = nee.mis * nee.value
         L = s.met.mis * s.met.value + dr.select(nee.seen, dr.detach(f_em) * from_emitter, 0)
         own = dr.select(nee.seen, f_em_grad * from_emitter, 0) + self._from_lights(s, dr.detach(f_em))
         self.dL += dr.select(active, self.β_grad * L + s.β * own, 0)
         weight = onward.scattering.weight / onward.survival
-        β_grad = self.β_grad * weight + dr.select(smooth, s.β * f_grad * onward.likelihood().inv_pdf(), 0)
+        β_grad = self.β_grad * weight + dr.select(onward.alive, s.β * f_grad * onward.likelihood().inv_pdf(), 0)
         self.β_grad = dr.select(active & onward.alive, β_grad, self.β_grad)
 
     def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:

@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
+from ..paths.delta_step import delta_step
 from ..paths.recording import GRAZING
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
@@ -142,6 +143,12 @@ def emitter_behind(scene: mi.Scene, following: Arrival, si, active: mi.Bool) -> 
     return emitter, active & (following.weight_emission > 0) & (emitter != None)  # noqa: E711 (an array comparison)
 
 
-def throughput_ratio(vertex: Vertex, following: Arrival) -> mi.Spectrum:
-    """Weight of a delta lobe, which has no value to evaluate: a constant here."""
-    return dr.select(vertex.β != 0, following.β / vertex.β, 0)
+def delta_factor(vertex: Vertex, following: Arrival, si, bsdf: mi.BSDFPtr) -> mi.Spectrum:
+    """Factor w of a delta lobe whose direction rests, attached to what the lobe is worth.
+
+    Its value is the ratio of recorded throughputs, also of lobes that a direction does not tell from each other. In
+    channels that are black by then there is no such ratio, but there may be a derivative before them.
+    """
+    delta = vertex.onward.delta
+    w = delta_step(mi.BSDFContext(), si, bsdf, following.hit.d, delta).value * vertex.onward.inv_pdf()
+    return dr.select(vertex.β != 0, dr.replace_grad(dr.detach(following.β / vertex.β), w), w)

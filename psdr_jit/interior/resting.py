@@ -1,6 +1,6 @@
 """No flow at all: what is emitted and reflected depends on θ, but no path, direction or measure does.
 
-Emission then counts where it is met, as in a primal path tracer, and delta lobes are constants.
+Emission then counts where it is met, as in a primal path tracer, and delta lobes keep their directions.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import mitsuba as mi
 from ..core.records import Arrival, Vertex
 from ..paths.tube_surface import surface_at
 from ..plan.motion import Displacements
-from .flow import Flow, SceneTraits, VertexTerms, throughput_ratio
+from .flow import Flow, SceneTraits, VertexTerms, delta_factor
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RestingFlow(Flow):
         f = bsdf.eval(mi.BSDFContext(), si, si.to_local(following.hit.d), goes_on)
         w = f * vertex.onward.inv_pdf()
         if self.traits.delta_lobes:
-            w = dr.select(vertex.onward.delta, throughput_ratio(vertex, following), w)
+            w = dr.select(vertex.onward.delta, delta_factor(vertex, following, si, bsdf), w)
         return VertexTerms(si.p, following.hit.d, L, w)
 
     def _next_event(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, vertex: Vertex) -> mi.Spectrum:

@@ -121,7 +121,7 @@ def _along_the_walk(job: Job, p: CameraPass) -> mi.Spectrum:
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
     sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
     lights = any(e.radiance for e in job.facts.emitters)
-    sink = (RadianceTangents if lights else MaterialTangents).zero()
+    sink = (RadianceTangents if lights else MaterialTangents).zero(job.facts.has_delta_lobes)
     walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
     return job.call.counters.rejected.keep_finite(sink.dL)
 

@@ -125,7 +125,8 @@ def _turned(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> tuple[mi.Normal3f, m
 
 def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None) -> ProbeMotion:
     """The probe of a scene, about the middle of what moves."""
-    moving = {shape.index for shape in facts.shapes if shape.moves and shape.index >= 0}
+    # glass that bends paths takes part: what is seen through it moves much as if it did
+    moving = {s.index for s in facts.shapes if (s.moves or s.bends) and s.index >= 0}
     box = mi.ScalarBoundingBox3f()
     for index in moving:
         box.expand(scene.shapes()[index].bbox())

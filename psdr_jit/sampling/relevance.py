@@ -115,11 +115,12 @@ def line_weights(job: Job, use: Use) -> list[mi.Float]:
 
 
 def _movers(job: Job, use: Use) -> Movers | None:
-    """None if every edge moves relative to something (as shadows do with a light), or if no shape moves."""
+    """None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves."""
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]
-    if facts.camera_moves or (use is Use.SHADOW and light_moves) or not moving or not job.plan.prunes:
+    everywhere = facts.camera_moves or facts.paths_bend or (use is Use.SHADOW and light_moves)
+    if everywhere or not moving or not job.plan.prunes:
         return None
     shapes = job.scene.shapes()
     box = mi.ScalarBoundingBox3f()

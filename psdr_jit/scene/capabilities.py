@@ -21,6 +21,7 @@ PLUGIN_NAMES = {
     "RoughPlastic": "roughplastic", "Principled": "principled", "PrincipledThin": "principledthin",
     "Measured": "measured", "Hair": "hair", "MaskBSDF": "mask", "TwoSidedBRDF": "twosided",
     "BlendBSDF": "blendbsdf", "BumpMap": "bumpmap", "NormalMap": "normalmap",
+    "DifferentiableDielectric": "psdr_dielectric", "DifferentiablePlastic": "psdr_plastic",
     # emitters
     "AreaLight": "area", "DirectionalArea": "directionalarea", "ConstantBackgroundEmitter": "constant",
     "EnvironmentMapEmitter": "envmap", "SunskyEmitter": "sunsky", "TimedSunskyEmitter": "timed_sunsky",
@@ -34,7 +35,7 @@ PLUGIN_NAMES = {
     "BitmapTexture": "bitmap", "BitmapTextureImpl": "bitmap", "Checkerboard": "checkerboard",
     "MeshAttribute": "mesh_attribute", "VolumeAdapter": "volume",
 }  # fmt: skip
-"""C++ class name -> the name used in scene files, which is the one a message should use."""
+"""Class name -> the name used in scene files, which is the one a message should use."""
 
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
@@ -67,11 +68,23 @@ PATTERN_PLUGINS = frozenset({"checkerboard", "bitmap", "bumpmap", "mesh_attribut
 FRAME_FREE_PLUGINS = frozenset({
     "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
     "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",
+    "psdr_dielectric", "psdr_plastic",
 })  # fmt: skip
 """Materials that do not see how the shading frame is turned about the normal, unless flagged as anisotropic."""
 
-SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance")})
+SMOOTH_PARAMETERS = frozenset({("plastic", "diffuse_reflectance"), ("psdr_plastic", "diffuse_reflectance")})
 """(plugin, parameter) of materials with a delta lobe: those that only shape the smooth lobe beside it."""
+
+WEIGHED_PLUGINS = frozenset({
+    "conductor", "dielectric", "thindielectric", "plastic", "psdr_dielectric", "psdr_plastic", "twosided",
+})  # fmt: skip
+"""Materials whose samples tell what their delta lobes are worth, attached to their parameters."""
+
+TWINS = {("dielectric", "eta"): "psdr_dielectric", ("plastic", "eta"): "psdr_plastic"}
+"""(plugin, parameter) that Mitsuba keeps as a plain number: our plugin that is the same otherwise."""
+
+BENDING_PARAMETERS = frozenset({("psdr_dielectric", "eta")})
+"""(plugin, parameter): those that turn the direction in which a delta lobe leads."""
 
 UNIFORM_EMITTERS = frozenset({"area", "constant", "point", "spot", "directional"})
 """Lights that look the same from everywhere unless textured, or cannot be seen at all."""
@@ -116,8 +129,9 @@ SUPPORT = (
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "yes",
         _MOVING + "beside instances and curves: error; seen in them, frames of projectors and hard rims: warning"),
-    Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
-        "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
+    Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",
+        "IOR: `psdr_dielectric`, `psdr_plastic` in place of `dielectric`, `plastic`, which keep it as a plain number; "
+        "behind glass as in the row above; opacity of a mask, what is under it or a bump map, normals: error"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, face attributes", "yes", "where texture coordinates move: warning"),

@@ -180,11 +180,11 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
-    """The sweeps take the weight and the direction of a delta lobe for constants (see `interior.flow`)."""
+    """What delta lobes under others are worth is not known, and directions follow normals where geometry moves only."""
     for shape in facts.shapes:  # where geometry moves, directions follow the normals
         watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
-        steering = [name for name in watched if name == VERTEX_NORMALS or shape.delta_varies]
-        enabled = list(shape.delta_weights) + [f"{shape.name}.{name}" for name in steering]
+        steering = [name for name in watched if name == VERTEX_NORMALS or shape.lost_varies]
+        enabled = list(shape.lost_weights) + [f"{shape.name}.{name}" for name in steering]
         if enabled:
             yield Finding(
                 UnsupportedError, shape.name,

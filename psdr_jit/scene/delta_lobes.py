@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from .capabilities import SMOOTH_PARAMETERS
+from .capabilities import BENDING_PARAMETERS, SMOOTH_PARAMETERS, WEIGHED_PLUGINS
 from .graph import SceneGraph, named_children, plugin_name
 
 BENT_NORMALS = frozenset({"bumpmap", "normalmap"})
@@ -28,11 +28,13 @@ def delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
     return tuple(lobes)
 
 
-def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
-    """Enabled parameters that scale or steer a delta lobe (full names), and whether one varies over the surface.
+def lost_weights(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ...], bool]:
+    """Enabled parameters of delta lobes whose derivative is not known (full names), and whether one such varies.
 
     A BSDF that only wraps others (`mask`, `blendbsdf`, `normalmap`) counts when one of those has a delta lobe.
     """
+    if all(plugin_name(node) in WEIGHED_PLUGINS for node in graph.walk(bsdf) if isinstance(node, mi.BSDF)):
+        return (), False
     enabled, varies = {}, False
     for node in graph.walk(bsdf):
         if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
@@ -47,6 +49,13 @@ def weights_of_delta_lobes(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tup
             varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
         enabled |= dict.fromkeys(graph.enabled_full(node))
     return tuple(enabled), varies
+
+
+def bending(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:
+    """Enabled parameters that turn the directions of delta lobes, by their full names."""
+    nodes = [node for node in graph.walk(bsdf, skip=(mi.Shape,)) if isinstance(node, mi.BSDF)]
+    turning = [n for n in nodes if any((plugin_name(n), name) in BENDING_PARAMETERS for name in graph.enabled_of(n))]
+    return tuple(name for node in turning for name in graph.enabled_full(node))
 
 
 def lobes_not_followed(graph: SceneGraph, bsdf: mi.BSDF | None) -> str:

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
 from .capabilities import ANALYTIC_SHAPES, CURVE_SHAPES, INSTANCING, UNSUPPORTED_SHAPES
-from .delta_lobes import blends_delta, delta_lobes, lobes_not_followed, weights_of_delta_lobes
+from .delta_lobes import bending, blends_delta, delta_lobes, lobes_not_followed, lost_weights
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
@@ -49,8 +49,9 @@ class ShapeFacts:
     bsdf: str  # plugin, as written in XML
     bsdf_flags: int  # mi.BSDFFlags
     delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
-    delta_weights: tuple[str, ...]  # enabled parameters that scale or steer a delta lobe, full names
-    delta_varies: bool  # such a parameter, enabled or not, varies over the surface
+    lost_weights: tuple[str, ...]  # enabled parameters of delta lobes whose derivative is not known, full names
+    lost_varies: bool  # such a parameter, enabled or not, varies over the surface
+    bends: tuple[str, ...]  # enabled parameters that turn the directions of its delta lobes, full names
     delta_obstacle: str  # why directions cannot be followed through them, "" if they can
     blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
     patterns: tuple[str, ...]  # textures that step inside the surface, "checkerboard 'floor'", ...
@@ -113,9 +114,14 @@ class SceneFacts:
         return any(emitter.pose for emitter in self.emitters)
 
     @property
+    def paths_bend(self) -> bool:
+        """Directions behind delta lobes turn: an index of refraction depends on θ."""
+        return any(shape.bends for shape in self.shapes)
+
+    @property
     def geometry_moves(self) -> bool:
-        """Discontinuities may move: a shape, a light's pose, or the camera depends on θ."""
-        return self.shapes_move or self.emitters_move or self.camera_moves
+        """Paths and discontinuities may move: a shape, a light's pose, the camera or refraction depends on θ."""
+        return self.shapes_move or self.emitters_move or self.camera_moves or self.paths_bend
 
     @property
     def has_delta_emitters(self) -> bool:
@@ -203,7 +209,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
     shading = tuple(name for name in enabled if _only_shades(name))
     jumps = jumping_textures(graph, bsdf)
     steps = jumps + jumping_textures(graph, shape.emitter())
-    delta_weights, delta_varies = weights_of_delta_lobes(graph, bsdf)
+    weights, varies = lost_weights(graph, bsdf)
     if plugin in INSTANCING:
         kind = "instance"
     elif plugin in UNSUPPORTED_SHAPES or (group and plugin in CURVE_SHAPES):
@@ -233,8 +239,9 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         bsdf=plugin_name(bsdf) if bsdf is not None else "none",
         bsdf_flags=bsdf.flags() if bsdf is not None else 0,
         delta_lobes=delta_lobes(graph, bsdf),
-        delta_weights=delta_weights,
-        delta_varies=delta_varies,
+        lost_weights=weights,
+        lost_varies=varies,
+        bends=bending(graph, bsdf),
         delta_obstacle=lobes_not_followed(graph, bsdf) if delta_lobes(graph, bsdf) else "",
         blends_delta=blends_delta(graph, bsdf),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from psdr_jit.core.compat import VERTEX_NORMALS, VERTEX_POSITIONS
 from psdr_jit.errors import ParameterError, SceneError
-from psdr_jit.scene.capabilities import COPIES, INSTANCING
+from psdr_jit.scene.capabilities import COPIES, INSTANCING, TWINS
 from psdr_jit.scene.names import plugin_name, stable_name, traverse
 
 
@@ -131,6 +131,9 @@ def _suggestion(name: str, known: list[str]) -> str:
 def _describe(params: Any, name: str) -> ParamInfo:
     value = parameter_value(params, name)
     reason = _obstacle(name, value) or _rests(params, name)
+    twin = TWINS.get((plugin_name(params.properties[name][2]), name.rsplit(".", 1)[-1]))
+    if reason and twin:
+        reason += f"; '{twin}' is the same material without this limit"
     differentiable = not reason
     if differentiable and name.endswith("vertex_normals"):
         reason = "shading normals; Mitsuba recomputes them whenever vertex_positions change"

@@ -286,15 +286,10 @@ def test_faces_without_a_place_in_a_surface(extra, words):
 # Lobes whose weight is taken for a constant
 
 GREY = {"type": "rgb", "value": 0.8}
+MIRROR = {"type": "conductor", "specular_reflectance": GREY}
 DELTA = [
-    ({"type": "dielectric", "specular_reflectance": GREY}, "specular_reflectance.value"),
-    ({"type": "dielectric", "specular_transmittance": GREY}, "specular_transmittance.value"),
-    ({"type": "thindielectric", "specular_transmittance": GREY}, "specular_transmittance.value"),
-    ({"type": "conductor", "specular_reflectance": GREY}, "specular_reflectance.value"),
-    ({"type": "conductor", "material": "Cu"}, "eta.value"),
-    ({"type": "plastic", "specular_reflectance": GREY}, "specular_reflectance.value"),
-    ({"type": "twosided", "b": {"type": "conductor", "specular_reflectance": GREY}},
-     "brdf_0.specular_reflectance.value"),
+    ({"type": "mask", "opacity": 0.5, "b": MIRROR}, "nested_bsdf.specular_reflectance.value"),
+    ({"type": "bumpmap", "t": {"type": "checkerboard"}, "b": MIRROR}, "nested_bsdf.specular_reflectance.value"),
     ({"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}, "opacity.value"),
     ({"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": {"type": "conductor"}},
      "bsdf_0.reflectance.value"),
@@ -315,9 +310,15 @@ def test_parameters_of_delta_lobes_are_not_silently_zero(bsdf, parameter):
     ({"type": "mask", "opacity": 0.5, "b": {"type": "diffuse"}}, "nested_bsdf.reflectance.value"),
     ({"type": "roughplastic", "specular_reflectance": GREY}, "specular_reflectance.value"),
     ({"type": "roughdielectric"}, "eta"),
+    ({"type": "dielectric", "specular_reflectance": GREY}, "specular_reflectance.value"),
+    ({"type": "thindielectric", "specular_transmittance": GREY}, "specular_transmittance.value"),
+    ({"type": "conductor", "material": "Cu"}, "eta.value"),
+    ({"type": "psdr_plastic", "specular_reflectance": GREY}, "specular_reflectance.value"),
+    ({"type": "psdr_plastic"}, "eta"),
+    ({"type": "twosided", "b": MIRROR}, "brdf_0.specular_reflectance.value"),
     ({"type": "hair"}, "eumelanin"),
 ])  # fmt: skip
-def test_parameters_beside_delta_lobes_are_fine(bsdf, parameter):
+def test_parameters_of_and_beside_delta_lobes_that_are_fine(bsdf, parameter):
     scene = load(box={"type": "cube", "bsdf": bsdf})
     enabled(scene, f"box.bsdf.{parameter}")
     checks.require_supported(analyse(scene))

@@ -201,7 +201,8 @@ def test_class_names_are_translated_to_plugin_names():
     for plugin in ("cube", "rectangle", "disk", "sphere", "cylinder"):
         assert PLUGIN_NAMES[mi.load_dict({"type": plugin}).class_name()] == plugin
     bsdfs = ("diffuse", "dielectric", "thindielectric", "conductor", "plastic", "null", "roughconductor",
-             "roughdielectric", "roughplastic", "principled", "principledthin", "hair")  # fmt: skip
+             "roughdielectric", "roughplastic", "principled", "principledthin", "hair", "psdr_dielectric",
+             "psdr_plastic")  # fmt: skip
     for plugin in bsdfs + ("point", "spot", "directional", "constant", "area", "sunsky"):
         assert PLUGIN_NAMES[mi.load_dict({"type": plugin}).class_name()] == plugin
 
@@ -266,6 +267,7 @@ def test_a_plain_scene_passes_without_a_word():
     ("bsdf", "lobes"),
     [
         ({"type": "dielectric"}, {"dielectric: DeltaReflection", "dielectric: DeltaTransmission"}),
+        ({"type": "psdr_dielectric"}, {"psdr_dielectric: DeltaReflection", "psdr_dielectric: DeltaTransmission"}),
         ({"type": "thindielectric"}, {"thindielectric: DeltaReflection", "thindielectric: Null"}),
         ({"type": "conductor"}, {"conductor: DeltaReflection"}),
         ({"type": "twosided", "b": {"type": "plastic"}}, {"plastic: DeltaReflection"}),
