@@ -83,7 +83,7 @@ def mesh_mesh(a: TriangleMesh, b: TriangleMesh) -> Segments:
     return _segments(face_a.astype(np.int64), face_b.astype(np.int64), x, len(b.faces))
 
 
-def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
+def in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Which of `corners` (N, k) have bounding boxes that overlap `box`? By the outcodes of the vertices."""
     code = np.zeros(len(positions), np.uint8)
     for axis in range(3):
@@ -94,7 +94,7 @@ def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.n
 
 def _pierced(own: TriangleMesh, other: TriangleMesh, box: np.ndarray, tol: float):
     """Edges of `own` through faces of `other`: `(edge, face, point)`."""
-    edge, face = _in_box(own.positions, own.edges, box), _in_box(other.positions, other.faces, box)
+    edge, face = in_box(own.positions, own.edges, box), in_box(other.positions, other.faces, box)
     ends = own.positions[own.edges[edge]].astype(float)
     corners = other.positions[other.faces[face]].astype(float)
     if len(edge) * len(face) > ALL_PAIRS:
@@ -201,7 +201,7 @@ def ball_mesh(centre: np.ndarray, radius: float, b: TriangleMesh, pieces: int) -
     box = np.stack([centre - radius, centre + radius])
     tol = tolerance(box, b.box)
     out = []
-    for f in _in_box(b.positions, b.faces, box):
+    for f in in_box(b.positions, b.faces, box):
         corners = b.positions[b.faces[f]].astype(float)
         p, q, r = corners
         n = np.cross(q - p, r - p)

@@ -92,7 +92,7 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
     found, changed = [], False
     for a, b in _pairs(solids, balls):
         key = (a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
-        state = (_state(a), _state(b))
+        state = (state_of(a), state_of(b))
         known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
             known = (state, _within(a) if a is b else _pair(a, b))
@@ -127,7 +127,7 @@ class _State:
     buffer: mi.Float | None
 
 
-def _state(item: Solid | Ball) -> _State:
+def state_of(item: Solid | Ball) -> _State:
     if isinstance(item, Ball):
         return _State((item.moves, *box_of(item.shape).ravel()), None)
     buffer = dr.detach(positions_buffer(item.mesh))
@@ -136,7 +136,7 @@ def _state(item: Solid | Ball) -> _State:
 
 def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
     """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
-    mesh_a = _triangles(a)
+    mesh_a = triangles(a)
     if isinstance(b, Ball):
         to_world = np.array(dr.detach(mi.traverse(b.shape)["to_world"].matrix), dtype=float).reshape(4, 4)
         centre, radius = to_world[:3, 3], np.linalg.norm(to_world[:3, 0])
@@ -147,7 +147,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         n_b = middle / np.linalg.norm(middle, axis=1, keepdims=True)
         sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
         return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
-    mesh_b = _triangles(b)
+    mesh_b = triangles(b)
     try:
         found = cut.mesh_mesh(mesh_a, mesh_b)
     except cut.TooManyPairs:
@@ -157,7 +157,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
 
 def _within(solid: Solid) -> tuple | None:
     """As `_pair`, of the surfaces that one mesh consists of."""
-    mesh = _triangles(solid)
+    mesh = triangles(solid)
     try:
         found = cut_parts(mesh, solid.parts)
     except cut.TooManyPairs:
@@ -186,7 +186,7 @@ def _between(a: Solid, mesh_a: cut.TriangleMesh, b: Solid, mesh_b: cut.TriangleM
     return found.start[steep], found.end[steep], sheet_a, sheet_b, arcs, a, b
 
 
-def _triangles(solid: Solid) -> cut.TriangleMesh:
+def triangles(solid: Solid) -> cut.TriangleMesh:
     with dr.suspend_grad():
         positions = np.array(dr.detach(mesh_positions(solid.mesh))).T
         faces = np.array(mesh_faces(solid.mesh)).T
