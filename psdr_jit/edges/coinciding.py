@@ -15,8 +15,8 @@ import numpy as np
 
 from ..core.upload import uploaded
 from .contacts import Contact
-from .junctions import Solid
 from .rows import EdgeRows
+from .solids import Solid
 from .topology import weld_vertices
 
 #: Coinciding edges are looked for among all edges up to this many, among borders only beyond (a cost per call).

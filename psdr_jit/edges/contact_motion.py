@@ -18,7 +18,7 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from .contacts import Contact
 from .intersections import TriangleMesh, barycentric
-from .junctions import Solid, triangles
+from .solids import Solid, triangles
 from .touching import Resting
 
 #: Relative speed that counts as parting, relative to the largest speed of the two shapes: rounding is far below.

@@ -12,16 +12,16 @@ import numpy as np
 
 from ..core.memory import Memory, Slot
 from . import intersections as cut
-from .junctions import Solid, state_of, triangles
 from .overlaps import box_of
+from .solids import Solid, state_of, triangles
 from .topology import INVALID, WELD_TOLERANCE
 from .touching import Resting, Shared, parts_in_faces, shared_parts
 
 #: Exterior angle below which two faces count as one, and their edge is nothing that is seen [rad].
 FLAT = 1e-4
 
-#: Edges of one mesh of several surfaces up to which all are compared with each other, not its borders alone.
-MAX_EDGES_WITHIN = 20000
+#: Edges of a mesh near the other one up to which all are looked at, not its borders alone: a cost per call.
+MAX_EDGES = 20000
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _between(a: Solid, b: Solid) -> Contact | None:
     common = cut.overlap(mesh_a.box, mesh_b.box, tol)
     if common is None:
         return None
-    edges_a, edges_b = (_seen(m, cut.in_box(m.positions, m.edges, common)) for m in (mesh_a, mesh_b))
+    edges_a, edges_b = (_few(m, _seen(m, cut.in_box(m.positions, m.edges, common))) for m in (mesh_a, mesh_b))
     shared = shared_parts(_ends(mesh_a, edges_a), _ends(mesh_b, edges_b), tol)
     shared = Shared(edges_a[shared.a], edges_b[shared.b], shared.on_a, shared.on_b)
     a_in_b, b_in_a = (
@@ -85,7 +85,7 @@ def _between(a: Solid, b: Solid) -> Contact | None:
 def _within(solid: Solid) -> Contact | None:
     """Edges of one mesh that share a part of their length; those that are one and the same are welded elsewhere."""
     mesh, t = triangles(solid), solid.topology
-    several = solid.parts and len(t) <= MAX_EDGES_WITHIN
+    several = solid.parts and len(t) <= MAX_EDGES
     edges = _seen(mesh, np.arange(len(t))) if several else np.flatnonzero(t.border)
     ends = _ends(mesh, edges)
     tol = WELD_TOLERANCE * (np.linalg.norm(mesh.box[1] - mesh.box[0]) + np.abs(mesh.box).max())
@@ -98,6 +98,10 @@ def _within(solid: Solid) -> Contact | None:
         solid, solid, Shared(edges[shared.a[once]], edges[shared.b[once]], shared.on_a[once], shared.on_b[once]),
         none, none,
     )  # fmt: skip
+
+
+def _few(mesh: cut.TriangleMesh, edges: np.ndarray) -> np.ndarray:
+    return edges if len(edges) <= MAX_EDGES else edges[mesh.edge_faces[edges, 1] == INVALID]
 
 
 def _in_faces(own: cut.TriangleMesh, edges: np.ndarray, other: cut.TriangleMesh, box: np.ndarray, tol: float):

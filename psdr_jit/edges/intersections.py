@@ -83,6 +83,24 @@ def mesh_mesh(a: TriangleMesh, b: TriangleMesh) -> Segments:
     return _segments(face_a.astype(np.int64), face_b.astype(np.int64), x, len(b.faces))
 
 
+def mesh_itself(a: TriangleMesh) -> Segments:
+    """Segments along which faces of one mesh cross each other. Raises `TooManyPairs` where it is too dense.
+
+    Of two faces that share a corner, at most one edge pierces the other face: the segment begins in the corner.
+    """
+    ends, corners = a.positions[a.edges].astype(float), a.positions[a.faces].astype(float)
+    edge, face, x = _near_crossings(ends, corners, tolerance(a.box))
+    hits = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))]
+    for side in a.edge_faces[edge].T.astype(np.int64):
+        has = side != INVALID
+        hits.append((np.minimum(side, face)[has], np.maximum(side, face)[has], x[has]))
+    one, other, x = (np.concatenate(column) for column in zip(*hits, strict=True))
+    apart = np.linalg.norm(corners[one][:, :, None] - corners[other][:, None], axis=3)
+    pair, k, _ = np.nonzero(apart <= tolerance(a.box))
+    one, other = np.append(one, one[pair]), np.append(other, other[pair])
+    return _segments(one, other, np.concatenate([x, corners[one[pair], k]]), len(a.faces))
+
+
 def in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Which of `corners` (N, k) have bounding boxes that overlap `box`? By the outcodes of the vertices."""
     code = np.zeros(len(positions), np.uint8)

@@ -24,7 +24,6 @@ from .buried import buried
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
-from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
@@ -36,6 +35,7 @@ from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
+from .solids import Ball
 from .table import EdgeTable
 
 #: Of one render call: the table.

@@ -21,10 +21,11 @@ from ..errors import SceneError, UnsupportedWarning
 from .coinciding import PointsBetween, divided, join_coinciding
 from .contacts import Contact, find_contacts
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
-from .junctions import Ball, JunctionTable, Solid, find_junctions
+from .junctions import JunctionTable, find_junctions
 from .parts import Part, parts_of
 from .rows import EdgeRows, concatenate
 from .shells import edge_shells
+from .solids import Ball, Solid
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
