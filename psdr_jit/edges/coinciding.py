@@ -160,6 +160,7 @@ def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
     dr.scatter(rows.n1, dr.select(parallel, -n1, n1), a)
     dr.scatter(rows.corner1, dr.select(parallel, corner1, mi.Vector2u(corner1.y, corner1.x)), a)
     dr.scatter(rows.prim1, of(rows.prim0, b), a)
+    dr.scatter(rows.inset1, of(rows.inset0, b), a)
     dr.scatter(rows.shape1, of(rows.shape0, b), a)
     dr.scatter(rows.border, mi.Bool(False), a)
     dr.scatter(rows.smooth, mi.Bool(False), a)

@@ -239,6 +239,7 @@ def _upload(found: list[tuple]) -> JunctionTable:
         v0=zeros, v1=zeros, p0=_point(start), p1=_point(end),
         n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
         angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
+        inset0=uploaded(mi.Float, np.zeros(count)), inset1=uploaded(mi.Float, np.zeros(count)),
         border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),
         traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
         shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),

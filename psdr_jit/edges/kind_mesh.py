@@ -13,7 +13,7 @@ from .film_cover import EdgeOnFilm, straight_cover
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import INSET, VISIBILITY_EPSILON, clearance, face_sides
+from .points import VISIBILITY_EPSILON, clearance, face_sides
 from .rows import EdgeRows, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
@@ -139,7 +139,7 @@ class MeshEdges(BetweenFaces):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
         pi.shape = dr.gather(mi.ShapePtr, self.shapes, dr.select(use1, rows.shape1, rows.shape0), active)
-        pi.prim_uv = uv + INSET * (mi.Point2f(1 / 3) - uv)
+        pi.prim_uv = uv + dr.select(use1, rows.inset1, rows.inset0) * (mi.Point2f(1 / 3) - uv)
         return pi
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:

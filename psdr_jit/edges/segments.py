@@ -230,6 +230,8 @@ def _rows(
         n1=g.n1,
         angle=g.angle,
         blur=g.blur,
+        inset0=g.inset0,
+        inset1=g.inset1,
         border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
         smooth=~jumps & is_smooth(mesh),

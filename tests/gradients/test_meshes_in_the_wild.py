@@ -38,6 +38,14 @@ def boxes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return all_of_it, np.concatenate([faces + k * len(points) for k in range(count)])
 
 
+def ribbon() -> tuple[np.ndarray, np.ndarray]:
+    """One connected open surface that cuts itself, with sharp corners: a strip bent as the letter alpha."""
+    bends = np.array([(-0.9, -0.45), (0.8, 0.35), (0.8, -0.35), (-0.9, 0.45)])
+    points = np.concatenate([np.insert(bends, 2, height, axis=1) for height in (-0.5, 0.5)])
+    faces = np.array([t for k in range(3) for t in ((k, k + 1, k + 5), (k, k + 5, k + 4))])
+    return points @ leaning((20, (0, 0, 1)), (15, (1, 0, 0))).T, faces
+
+
 def stack() -> tuple[np.ndarray, np.ndarray]:
     """A small box on a large one, flush in front and not above its end, as parts of one mesh."""
     points, faces = cube(1)
@@ -76,9 +84,10 @@ def test_bodies_of_one_mesh_that_cut_into_each_other(llvm):
 
 
 @pytest.mark.slow
-def test_bodies_of_one_mesh_that_lie_flush(llvm):
-    """What two edges of a stack have in common is one edge."""
-    motion = perturb(scene_of(*stack()), *MOVED)
+@pytest.mark.parametrize("shape", [stack, ribbon])
+def test_flush_bodies_and_a_surface_that_cuts_itself(llvm, shape):
+    """What two edges of a stack have in common is one edge; deep in a sharp corner it is not dark."""
+    motion = perturb(scene_of(*shape()), *MOVED)
     reference = fd(motion, SPEC, STEP, SEEDS, 4 * SPP)
     assert_grad_close(forward(motion, SPEC, SEEDS, SPP), reference, 0.01)
 
