@@ -1,8 +1,8 @@
-"""Shapes that lie flush and are moved apart, or into each other: there the image has a kink.
+"""Shapes that lie flush and are moved apart, or into each other: there the image has a kink, in general.
 
-One way a gap opens, the other way one shape sinks into the other and nothing is to be seen of it: the derivatives to
-the two sides differ, and no term knows which one is meant. Sliding along the contact is fine. Needs the direction of
-the derivative, which only forward mode has.
+One way a gap opens, through which one looks into the dark; the other way one shape sinks into the other, and the line
+where they meet stays where it is. The terms see neither of the two: for them the edge moves over what it rests on.
+Sliding along the contact is fine. Needs the direction of the derivative, which only forward mode has.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
             what = f"parts of shape {names[0]}" if contact.a is contact.b else f"shapes {names[0]} and {names[1]}"
             warn_once(
                 f"flush contact: {what} touch, and the motion parts them or presses them into each other. To one side "
-                "a gap opens, to the other it does not: the image has a kink here and no derivative, and what is "
-                f"computed is that of neither side. Lift or sink one of them by {CLEAR * (1 + job.facts.reach):.1g} "
-                "units, or slide it along the contact",
+                "a gap opens, to the other it does not: in general the image has a kink here and no derivative, and "
+                "what is computed is that of neither side. Lift or sink one of them by "
+                f"{CLEAR * (1 + job.facts.reach):.1g} units, or slide it along the contact",
                 UnsupportedWarning,
                 job.call.memory,
             )
