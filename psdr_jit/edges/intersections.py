@@ -19,6 +19,10 @@ CHUNK = 1 << 18
 ALL_PAIRS = 1 << 24
 MAX_TESTS = 1 << 26
 
+#: Parts in which `near_pairs` may hand out those of a mesh with itself, about three seconds: meshes of long slivers,
+#: whose boxes all overlap, are left out.
+MAX_PARTS_WITHIN = 12
+
 #: Surfaces closer than this, relative to their coordinates, rest on each other: their own edges are what is seen.
 RESTING = 1e-5
 
@@ -89,7 +93,7 @@ def mesh_itself(a: TriangleMesh) -> Segments:
     Of two faces that share a corner, at most one edge pierces the other face: the segment begins in the corner.
     """
     ends, corners = a.positions[a.edges].astype(float), a.positions[a.faces].astype(float)
-    edge, face, x = _near_crossings(ends, corners, tolerance(a.box))
+    edge, face, x = _near_crossings(ends, corners, tolerance(a.box), MAX_PARTS_WITHIN)
     hits = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))]
     for side in a.edge_faces[edge].T.astype(np.int64):
         has = side != INVALID
@@ -141,15 +145,15 @@ def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
     return e[inside], f[inside], x[inside]
 
 
-def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
+def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float, most_parts: int | None = None):
     """The same for many segments and triangles: only pairs whose boxes overlap are tested."""
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
     level = np.einsum("ij,ij->i", n, corners[:, 0])
     found, tests = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))], 0
-    for e, f in near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1)):
+    for part, (e, f) in enumerate(near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1))):
         tests += len(e)
-        if tests > MAX_TESTS:
+        if tests > MAX_TESTS or part == most_parts:
             raise TooManyPairs
         d0, d1 = (np.einsum("ij,ij->i", ends[e, k], n[f]) - level[f] for k in (0, 1))
         through = (d0 * d1 < 0) & (np.minimum(np.abs(d0), np.abs(d1)) > tol)
