@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.upload import uploaded
+from .points import face_inset
 from .topology import EdgeTopology
 
 UNIT_ROUNDOFF = 2.0**-24  # of float32, in which rays are traced
@@ -49,6 +50,8 @@ class EdgeGeometry:
     convex: mi.Bool  # seen from the side of the normals, the surface bends away; False on a border
     border: mi.Bool
     blur: mi.Float  # how far beside the edge a ray may still meet one of its faces, by rounding [m]
+    inset0: mi.Float  # share of the way from the edge to the centroid of f0 at which that face is looked at
+    inset1: mi.Float  # the same of f1
 
 
 def upload_topology(topology: EdgeTopology) -> EdgeTopologyDevice:
@@ -102,6 +105,8 @@ def edge_geometry(positions: mi.Point3f, faces: mi.Vector3u, topo_device: EdgeTo
         convex=~border & (dr.dot(n0, q1 - p0) < 0),
         border=border,
         blur=dr.maximum(_blur(p0, p1, q0), _blur(p0, p1, q1)),
+        inset0=face_inset(p0, p1, q0, n0, n1),
+        inset1=face_inset(p0, p1, q1, n0, n1),
     )
 
 

@@ -19,6 +19,10 @@ CHUNK = 1 << 18
 ALL_PAIRS = 1 << 24
 MAX_TESTS = 1 << 26
 
+#: Parts in which `near_pairs` may hand out those of a mesh with itself, about three seconds: meshes of long slivers,
+#: whose boxes all overlap, are left out.
+MAX_PARTS_WITHIN = 12
+
 #: Surfaces closer than this, relative to their coordinates, rest on each other: their own edges are what is seen.
 RESTING = 1e-5
 
@@ -83,7 +87,25 @@ def mesh_mesh(a: TriangleMesh, b: TriangleMesh) -> Segments:
     return _segments(face_a.astype(np.int64), face_b.astype(np.int64), x, len(b.faces))
 
 
-def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
+def mesh_itself(a: TriangleMesh) -> Segments:
+    """Segments along which faces of one mesh cross each other. Raises `TooManyPairs` where it is too dense.
+
+    Of two faces that share a corner, at most one edge pierces the other face: the segment begins in the corner.
+    """
+    ends, corners = a.positions[a.edges].astype(float), a.positions[a.faces].astype(float)
+    edge, face, x = _near_crossings(ends, corners, tolerance(a.box), MAX_PARTS_WITHIN)
+    hits = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))]
+    for side in a.edge_faces[edge].T.astype(np.int64):
+        has = side != INVALID
+        hits.append((np.minimum(side, face)[has], np.maximum(side, face)[has], x[has]))
+    one, other, x = (np.concatenate(column) for column in zip(*hits, strict=True))
+    apart = np.linalg.norm(corners[one][:, :, None] - corners[other][:, None], axis=3)
+    pair, k, _ = np.nonzero(apart <= tolerance(a.box))
+    one, other = np.append(one, one[pair]), np.append(other, other[pair])
+    return _segments(one, other, np.concatenate([x, corners[one[pair], k]]), len(a.faces))
+
+
+def in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Which of `corners` (N, k) have bounding boxes that overlap `box`? By the outcodes of the vertices."""
     code = np.zeros(len(positions), np.uint8)
     for axis in range(3):
@@ -94,7 +116,7 @@ def _in_box(positions: np.ndarray, corners: np.ndarray, box: np.ndarray) -> np.n
 
 def _pierced(own: TriangleMesh, other: TriangleMesh, box: np.ndarray, tol: float):
     """Edges of `own` through faces of `other`: `(edge, face, point)`."""
-    edge, face = _in_box(own.positions, own.edges, box), _in_box(other.positions, other.faces, box)
+    edge, face = in_box(own.positions, own.edges, box), in_box(other.positions, other.faces, box)
     ends = own.positions[own.edges[edge]].astype(float)
     corners = other.positions[other.faces[face]].astype(float)
     if len(edge) * len(face) > ALL_PAIRS:
@@ -123,15 +145,15 @@ def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
     return e[inside], f[inside], x[inside]
 
 
-def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
+def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float, most_parts: int | None = None):
     """The same for many segments and triangles: only pairs whose boxes overlap are tested."""
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
     level = np.einsum("ij,ij->i", n, corners[:, 0])
     found, tests = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))], 0
-    for e, f in near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1)):
+    for part, (e, f) in enumerate(near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1))):
         tests += len(e)
-        if tests > MAX_TESTS:
+        if tests > MAX_TESTS or part == most_parts:
             raise TooManyPairs
         d0, d1 = (np.einsum("ij,ij->i", ends[e, k], n[f]) - level[f] for k in (0, 1))
         through = (d0 * d1 < 0) & (np.minimum(np.abs(d0), np.abs(d1)) > tol)
@@ -201,7 +223,7 @@ def ball_mesh(centre: np.ndarray, radius: float, b: TriangleMesh, pieces: int) -
     box = np.stack([centre - radius, centre + radius])
     tol = tolerance(box, b.box)
     out = []
-    for f in _in_box(b.positions, b.faces, box):
+    for f in in_box(b.positions, b.faces, box):
         corners = b.positions[b.faces[f]].astype(float)
         p, q, r = corners
         n = np.cross(q - p, r - p)

@@ -17,45 +17,30 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import mesh_faces, mesh_positions, positions_buffer
 from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
 from . import intersections as cut
 from .overlaps import box_of, crossing
-from .parts import Part, cut_parts
+from .parts import crosses_itself, cut_parts
 from .rows import EdgeRows
+from .solids import Ball, Solid, state_of, triangles
 from .topology import EdgeTopology
 
 #: Pieces into which the full circle of a ball in a plane is cut.
 ARC_PIECES = 64
 
-
 #: By the names of two shapes: their states, and the junctions found for these.
 PAIRS: Slot[dict[tuple[str, str], tuple]] = Slot(dict)
 
+#: Edges of a mesh up to which it is looked at anew in every place whether it cuts itself: a cost per call.
+FEW_EDGES = 500
+
+#: By the name of a mesh: its topology, and whether it cut itself when that was new.
+CUTTING: Slot[dict[str, tuple[EdgeTopology, bool]]] = Slot(dict)
+
 #: The junctions (by identity) that were uploaded last, and their table.
 UPLOADED: Slot[tuple | None] = Slot(lambda: None)
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A mesh of an edge set."""
-
-    mesh: mi.Mesh
-    index: int  # in the edge set
-    moves: bool
-    topology: EdgeTopology
-    shell: mi.Float  # by edge of the topology
-    parts: tuple[Part, ...] = ()  # its connected surfaces, if there are several
-
-
-@dataclass(frozen=True)
-class Ball:
-    """An analytic sphere."""
-
-    shape: mi.Shape
-    moves: bool
 
 
 @dataclass
@@ -90,12 +75,12 @@ class JunctionTable:
 def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> JunctionTable | None:
     """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `memory`."""
     found, changed = [], False
-    for a, b in _pairs(solids, balls):
+    for a, b in _pairs(solids, balls, memory):
         key = (a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
-        state = (_state(a), _state(b))
+        state = (state_of(a), state_of(b))
         known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
-            known = (state, _within(a) if a is b else _pair(a, b))
+            known = (state, _within(a, memory) if a is b else _pair(a, b))
             memory[PAIRS][key] = known
             changed = True
         if known[1] is not None:
@@ -109,34 +94,36 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
     return table[1]
 
 
-def _pairs(solids: list[Solid], balls: tuple[Ball, ...]) -> list[tuple[Solid, Solid | Ball]]:
-    """Pairs that may intersect, by their bounding boxes; at least one is a mesh. A mesh of several surfaces pairs with
-    itself.
+def _pairs(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> list[tuple[Solid, Solid | Ball]]:
+    """Pairs that may intersect, by their bounding boxes; at least one is a mesh. A mesh of several surfaces, or that
+    cuts itself, pairs with itself.
     """
     items = [*solids, *balls]
     boxes = [box_of(item.mesh if isinstance(item, Solid) else item.shape) for item in items]
     pairs = [(items[i], items[j]) for i, j in crossing(boxes) if i < len(solids)]
-    return pairs + [(solid, solid) for solid in solids if solid.parts]
+    return pairs + [(solid, solid) for solid in solids if solid.parts or _cuts_itself(solid, memory)]
 
 
-@dataclass(frozen=True)
-class _State:
-    """Changes when the shape does. The buffer is kept alive, so that its index identifies it."""
+def _cuts_itself(solid: Solid, memory: Memory) -> bool:
+    """Does, or may, a connected surface of the mesh cut itself? A large one is looked at when its topology is new."""
+    known = memory[CUTTING].get(solid.mesh.id())
+    if known is None or known[0] is not solid.topology:
+        known = (solid.topology, len(solid.topology) <= FEW_EDGES or _crosses(solid))
+        memory[CUTTING][solid.mesh.id()] = known
+    return known[1]
 
-    key: tuple
-    buffer: mi.Float | None
 
-
-def _state(item: Solid | Ball) -> _State:
-    if isinstance(item, Ball):
-        return _State((item.moves, *box_of(item.shape).ravel()), None)
-    buffer = dr.detach(positions_buffer(item.mesh))
-    return _State((item.moves, item.index, buffer.index), buffer)
+def _crosses(solid: Solid) -> bool:
+    """Does a connected surface of the mesh cut itself? Not where it would take too long to know: that is rare."""
+    try:
+        return crosses_itself(triangles(solid), solid.parts)
+    except cut.TooManyPairs:
+        return False
 
 
 def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
     """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
-    mesh_a = _triangles(a)
+    mesh_a = triangles(a)
     if isinstance(b, Ball):
         to_world = np.array(dr.detach(mi.traverse(b.shape)["to_world"].matrix), dtype=float).reshape(4, 4)
         centre, radius = to_world[:3, 3], np.linalg.norm(to_world[:3, 0])
@@ -147,7 +134,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         n_b = middle / np.linalg.norm(middle, axis=1, keepdims=True)
         sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
         return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
-    mesh_b = _triangles(b)
+    mesh_b = triangles(b)
     try:
         found = cut.mesh_mesh(mesh_a, mesh_b)
     except cut.TooManyPairs:
@@ -155,11 +142,11 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
     return _between(a, mesh_a, b, mesh_b, found)
 
 
-def _within(solid: Solid) -> tuple | None:
-    """As `_pair`, of the surfaces that one mesh consists of."""
-    mesh = _triangles(solid)
+def _within(solid: Solid, memory: Memory) -> tuple | None:
+    """As `_pair`, of the surfaces that one mesh consists of, or of one that cuts itself."""
+    mesh = triangles(solid)
     try:
-        found = cut_parts(mesh, solid.parts)
+        found = cut.mesh_itself(mesh) if _cuts_itself(solid, memory) else cut_parts(mesh, solid.parts)
     except cut.TooManyPairs:
         return _too_many(f"parts of shape '{solid.mesh.id()}'")
     return _between(solid, mesh, solid, mesh, found)
@@ -184,14 +171,6 @@ def _between(a: Solid, mesh_a: cut.TriangleMesh, b: Solid, mesh_b: cut.TriangleM
     sheet_a, sheet_b = ({k: v[steep] for k, v in sheet.items()} for sheet in (sheet_a, sheet_b))
     arcs = (np.zeros((steep.sum(), 3)), np.zeros(steep.sum()))
     return found.start[steep], found.end[steep], sheet_a, sheet_b, arcs, a, b
-
-
-def _triangles(solid: Solid) -> cut.TriangleMesh:
-    with dr.suspend_grad():
-        positions = np.array(dr.detach(mesh_positions(solid.mesh))).T
-        faces = np.array(mesh_faces(solid.mesh)).T
-    t = solid.topology
-    return cut.TriangleMesh(positions, faces, np.stack([t.v0, t.v1], 1), np.stack([t.f0, t.f1], 1))
 
 
 def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.ndarray, end: np.ndarray) -> dict:
@@ -259,6 +238,7 @@ def _upload(found: list[tuple]) -> JunctionTable:
         v0=zeros, v1=zeros, p0=_point(start), p1=_point(end),
         n0=mi.Normal3f(_point(a["n"])), n1=mi.Normal3f(_point(b["n"])),
         angle=uploaded(mi.Float, angle), blur=uploaded(mi.Float, np.zeros(count)),
+        inset0=uploaded(mi.Float, np.zeros(count)), inset1=uploaded(mi.Float, np.zeros(count)),
         border=_flags(count, False), seam=_flags(count, True), smooth=_flags(count, False), pattern=_flags(count, True),
         traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
         shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),

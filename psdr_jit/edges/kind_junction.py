@@ -15,14 +15,9 @@ from .kind import OnEdge, Side, Sight, Use
 from .kind_mesh import BetweenFaces, on_fixed, straight_point
 from .lights import LightBounds
 from .location import EdgeLocation
+from .points import LEAST_SLANT, clear_of_lift
 from .rows import EdgeRows
 from .wedges import Wedges, meeting_wedges
-
-#: Height at which Mitsuba starts rays above a surface, relative to 1 + the largest coordinate (`math::RayEpsilon`).
-MITSUBA_LIFT = 8.9e-5
-
-#: Side rays stay clear of that by this factor; of surfaces that meet almost flush, as if by this sine of their angle.
-CLEAR_OF_LIFT, LEAST_SLANT = 2.0, 0.05
 
 
 @dataclass(frozen=True)
@@ -62,8 +57,7 @@ class Junctions(BetweenFaces):
         Mitsuba lifts rays off a surface along its normal: closer to the curve they start above what overhangs.
         """
         n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
-        lift = MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
-        return CLEAR_OF_LIFT * lift / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
+        return clear_of_lift(x) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
 
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         side = dr.cross(dx, ω)

@@ -8,11 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame
+from .coinciding import PointsBetween
 from .film_cover import EdgeOnFilm, straight_cover
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import INSET, VISIBILITY_EPSILON, clearance, face_sides
+from .points import VISIBILITY_EPSILON, clearance, face_sides
 from .rows import EdgeRows, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
@@ -57,6 +58,7 @@ class MeshEdges(BetweenFaces):
     rows: EdgeRows
     shapes: mi.ShapePtr  # by EdgeRows.shape0 and shape1
     centre: mi.Point3f  # of the scene
+    between: PointsBetween | None = None  # ends of rows that are no vertices
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         seen = EdgeOnFilm.of(self.rows, frame)
@@ -137,11 +139,13 @@ class MeshEdges(BetweenFaces):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.prim_index = dr.select(use1, rows.prim1, rows.prim0)
         pi.shape = dr.gather(mi.ShapePtr, self.shapes, dr.select(use1, rows.shape1, rows.shape0), active)
-        pi.prim_uv = uv + INSET * (mi.Point2f(1 / 3) - uv)
+        pi.prim_uv = uv + dr.select(use1, rows.inset1, rows.inset0) * (mi.Point2f(1 / 3) - uv)
         return pi
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         positions = attached_positions(self.meshes)
+        if self.between is not None:
+            positions = self.between.added_to(positions)
         v0, v1 = (dr.gather(mi.UInt32, v, row, active) for v in (self.rows.v0, self.rows.v1))
         x0, x1 = (dr.gather(mi.Point3f, positions, v, active) for v in (v0, v1))
         x = (1 - at.t) * x0 + at.t * x1

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .intersections import Segments, TriangleMesh, mesh_mesh
+from .intersections import Segments, TriangleMesh, mesh_itself, mesh_mesh
 from .overlaps import crossing
 from .shells import face_components
 from .topology import INVALID, EdgeTopology
@@ -54,6 +54,14 @@ def cut_parts(mesh: TriangleMesh, parts: tuple[Part, ...]) -> Segments:
         s = mesh_mesh(alone[i], alone[j])
         found.append(Segments(parts[i].faces[s.face_a], parts[j].faces[s.face_b], s.start, s.end))
     return Segments(*(np.concatenate([getattr(s, name) for s in found]) for name in Segments.__dataclass_fields__))
+
+
+def crosses_itself(mesh: TriangleMesh, parts: tuple[Part, ...]) -> bool:
+    """Does one of the connected surfaces of a mesh cut itself? `parts`: () if there is one. Raises `TooManyPairs`."""
+    found, surface = mesh_itself(mesh), np.zeros(len(mesh.faces), int)
+    for number, part in enumerate(parts):
+        surface[part.faces] = number
+    return bool(np.any(surface[found.face_a] == surface[found.face_b]))
 
 
 def _alone(mesh: TriangleMesh, part: Part) -> TriangleMesh:

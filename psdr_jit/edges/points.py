@@ -23,6 +23,15 @@ ROUNDING_LEAD = 10.0
 #: rounding may put the point inside a surface on which the edge rests, and everything it sees would be occluded.
 INSET = 3e-4
 
+#: Largest such share, in sharp corners: see `face_inset`.
+LARGEST_INSET = 0.3
+
+#: Height at which Mitsuba starts rays above a surface, relative to 1 + the largest coordinate (`math::RayEpsilon`).
+MITSUBA_LIFT = 8.9e-5
+
+#: We stay clear of that by this factor; of surfaces that meet almost flush, as if by this sine of their angle.
+CLEAR_OF_LIFT, LEAST_SLANT = 2.0, 0.05
+
 #: Sine of the angle to its plane below which a face is seen edge-on: sixteen units in the last place of a direction.
 EDGE_ON = 1e-6
 
@@ -39,6 +48,23 @@ def clearance(x: mi.Point3f, size: mi.Float, centre: mi.Point3f, blur: mi.Float 
     visible = SIDE_OFFSET * (dr.max(dr.abs(x - centre)) + size)
     rounding = ROUNDING * dr.max(dr.abs(x)) + blur
     return visible + rounding, LEAD * visible + ROUNDING_LEAD * rounding
+
+
+def clear_of_lift(x: mi.Point3f) -> mi.Float:
+    """A height above a surface at `x` that is more than that at which Mitsuba starts rays [m]."""
+    return CLEAR_OF_LIFT * MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
+
+
+def face_inset(p0: mi.Point3f, p1: mi.Point3f, apex: mi.Point3f, n0: mi.Normal3f, n1: mi.Normal3f) -> mi.Float:
+    """Share of the way to the centroid at which a face with this `apex` is looked at from its edge p0 p1.
+
+    Mitsuba starts rays a height h above a face. Where two faces meet at an angle φ < 90 degrees (cos φ = -n0·n1), what
+    is nearer to the edge than h cot φ is then behind the other face, in the dark.
+    """
+    cot = dr.maximum(-dr.dot(n0, n1), 0) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
+    depth = dr.norm(dr.cross(p1 - p0, apex - p0)) / (3 * dr.norm(p1 - p0))
+    needed = dr.maximum(clear_of_lift(p0), clear_of_lift(p1)) * cot
+    return dr.select(needed < LARGEST_INSET * depth, dr.maximum(needed / depth, INSET), LARGEST_INSET)
 
 
 def facing(n: mi.Normal3f, towards: mi.Vector3f) -> mi.Float:

@@ -20,6 +20,8 @@ class EdgeRows:
     n1: mi.Normal3f
     angle: mi.Float  # exterior angle [rad]
     blur: mi.Float  # how far beside the edge a ray may still meet its faces, by rounding [m]
+    inset0: mi.Float  # share of the way from the edge to the centroid of face 0 at which that face is looked at
+    inset1: mi.Float  # the same of face 1
     border: mi.Bool
     seam: mi.Bool  # radiance may step here even where both faces are visible
     smooth: mi.Bool  # the faces share their shading normals: such a step is where one turns away from a light, no more

@@ -21,9 +21,9 @@ from ..plan.job import Job
 from ..scene.facts import ShapeFacts
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
+from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
-from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
@@ -35,6 +35,7 @@ from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
+from .solids import Ball
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -60,7 +61,9 @@ def edge_table(job: Job) -> EdgeTable:
     overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
     centre = varying(mi.Point3f, list(job.scene.bbox().center()))
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
-    kinds, hidden = _between_faces(job, _edge_set(job, meshes, balls), meshes, overlapping, centre)
+    straight = _edge_set(job, meshes, balls)
+    warn_about_parting(job, straight.contacts)
+    kinds, hidden = _between_faces(job, straight, meshes, overlapping, centre)
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
@@ -102,8 +105,9 @@ def _between_faces(
         rows = _as_seen(rows, outside)
         if job.options.direction == "known" and job.plan.prunes:
             speed = vertex_speeds(found.meshes)
+            speed = speed if found.between is None else found.between.added_to(speed)
             rows.moves = rows.moves & (sum(dr.gather(mi.Float, speed, v) for v in (rows.v0, rows.v1)) > 0)
-        kinds.append(MeshEdges(found.meshes, rows, found.shapes, centre))
+        kinds.append(MeshEdges(found.meshes, rows, found.shapes, centre, found.between))
     if found.junctions is not None:
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count

@@ -18,21 +18,21 @@ from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_bu
 from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
+from .coinciding import PointsBetween, divided, join_coinciding
+from .contacts import Contact, find_contacts
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
-from .junctions import Ball, JunctionTable, Solid, find_junctions
+from .junctions import JunctionTable, find_junctions
 from .parts import Part, parts_of
 from .rows import EdgeRows, concatenate
 from .shells import edge_shells
-from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology, weld_vertices
+from .solids import Ball, Solid
+from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
 
 #: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
 SEAM_TOLERANCE = 1e-4
-
-#: Coinciding edges are looked for among all edges up to this many, among borders only beyond (a cost per call).
-MAX_COMPARED_EDGES = 20000
 
 
 @dataclass
@@ -60,6 +60,8 @@ class EdgeSet:
     rows: EdgeRows | None
     shapes: mi.ShapePtr | None  # by EdgeRows.shape0 and shape1
     junctions: JunctionTable | None  # curves along which the meshes cut into each other, or balls into them
+    between: PointsBetween | None = None  # ends of rows that are no vertices; their numbers come after the vertices'
+    contacts: tuple[Contact, ...] = ()  # where meshes touch
 
 
 def edge_set(
@@ -72,8 +74,9 @@ def edge_set(
     """Edges of `meshes` in their present state; topologies are kept in `memory` from call to call.
 
     Intersection curves of meshes with each other and with `balls` have rows of their own. Coinciding edges of shapes
-    that all move, or all rest (`moving`), become one row: `join_coinciding`. `seams`: by mesh, the sides of faces along
-    which a pattern steps, 3 · face + opposite corner; None for meshes without.
+    that all move, or all rest (`moving`), become one row, whole edges or parts of them: `coinciding`.
+    `seams`: by mesh, the sides of faces along which a pattern steps, 3 · face + opposite corner; None for meshes
+    without.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
@@ -90,11 +93,14 @@ def edge_set(
         parts.append(_rows(mesh, (positions, faces), topology, jumps, i, first_vertex, moving[i]))
         solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell, topology.parts))
         first_vertex += dr.width(positions)
-    rows = join_coinciding(parts[0] if len(parts) == 1 else concatenate(parts), moving)
+    contacts = find_contacts(solids, memory)
+    rows = parts[0] if len(parts) == 1 else concatenate(parts)
+    rows, between, shared = divided(rows, solids, contacts, first_vertex)
+    rows = join_coinciding(rows, moving, shared)
     junctions = find_junctions(solids, balls, memory)
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
     dr.eval(rows)
-    return EdgeSet(tuple(meshes), rows, shapes, junctions)
+    return EdgeSet(tuple(meshes), rows, shapes, junctions, between, tuple(contacts))
 
 
 def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
@@ -224,6 +230,8 @@ def _rows(
         n1=g.n1,
         angle=g.angle,
         blur=g.blur,
+        inset0=g.inset0,
+        inset1=g.inset1,
         border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
         smooth=~jumps & is_smooth(mesh),
@@ -239,62 +247,3 @@ def _rows(
         corner0=topo.corner0,
         corner1=mi.Vector2u(topo.corner1),
     )
-
-
-def join_coinciding(rows: EdgeRows, moving: list[bool]) -> EdgeRows:
-    """Edges at the same place are one discontinuity and become one row.
-
-    Two borders become an edge with two faces. More than two, or an edge on an edge (stacked boxes), keep one row whose
-    sides are found by tracing rays, because topology no longer says which face is on top. Rows of a moving and of a
-    static shape are left apart: their motion relative to each other is what counts.
-    """
-    dr.eval(rows)
-    border = np.array(rows.border)
-    few = len(border) <= MAX_COMPARED_EDGES
-    candidate = np.arange(len(border)) if few else np.flatnonzero(border)
-    if len(candidate) < 2:
-        return rows
-    group = _coinciding(rows, candidate, np.array(moving)[np.array(rows.shape0)[candidate]])
-    if len(group) == 0:
-        return rows
-    pairs = [g for g in group if len(g) == 2 and border[g].all()]
-    others = [g for g in group if not (len(g) == 2 and border[g].all())]
-    if pairs:
-        _join_borders(rows, np.array(pairs))
-    for g in others:
-        dr.scatter(rows.traced, mi.Bool(True), uploaded(mi.UInt32, g[:1]))
-    keep = np.ones(len(border), bool)
-    for g in group:
-        keep[g[1:]] = False
-    return dr.gather(EdgeRows, rows, uploaded(mi.UInt32, np.flatnonzero(keep)))
-
-
-def _coinciding(rows: EdgeRows, candidate: np.ndarray, motion: np.ndarray) -> list[np.ndarray]:
-    """Groups of two or more rows with the same end points and the same entry in `motion`."""
-    index = uploaded(mi.UInt32, candidate)
-    ends = [np.array(dr.gather(mi.Point3f, p, index)).T for p in (rows.p0, rows.p1)]
-    start, end = weld_vertices(np.concatenate(ends)).reshape(2, -1)
-    count = max(start.max(), end.max()) + 1
-    key = (np.minimum(start, end) * count + np.maximum(start, end)) * 2 + motion
-    order = np.argsort(key, kind="stable")
-    _, first, length = np.unique(key[order], return_index=True, return_counts=True)
-    return [candidate[order[i : i + n]] for i, n in zip(first[length > 1], length[length > 1], strict=True)]
-
-
-def _join_borders(rows: EdgeRows, pairs: np.ndarray) -> None:
-    """Give the first border of every pair the second one's face, in place."""
-    a, b = uploaded(mi.UInt32, pairs[:, 0]), uploaded(mi.UInt32, pairs[:, 1])
-
-    def of(values, index):
-        return dr.gather(type(values), values, index)
-
-    # Seen from face a, face b continues the surface if it runs along the edge the other way round.
-    parallel = dr.dot(of(rows.p1, a) - of(rows.p0, a), of(rows.p1, b) - of(rows.p0, b)) > 0
-    n1, corner1 = of(rows.n0, b), of(rows.corner0, b)
-    dr.scatter(rows.n1, dr.select(parallel, -n1, n1), a)
-    dr.scatter(rows.corner1, dr.select(parallel, corner1, mi.Vector2u(corner1.y, corner1.x)), a)
-    dr.scatter(rows.prim1, of(rows.prim0, b), a)
-    dr.scatter(rows.shape1, of(rows.shape0, b), a)
-    dr.scatter(rows.border, mi.Bool(False), a)
-    dr.scatter(rows.smooth, mi.Bool(False), a)
-    dr.scatter(rows.seam, mi.Bool(True), a)

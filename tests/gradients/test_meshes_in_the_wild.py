@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-from helpers import TERMS, fd, forward
+import pytest
+from fuzz.meshes import box as cube
+from helpers import TERMS, assert_grad_close, fd, forward
 
 from benchmarks import meshes
 from psdr_jit.derivative.gradient import DerivativeSampler
@@ -36,6 +38,22 @@ def boxes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return all_of_it, np.concatenate([faces + k * len(points) for k in range(count)])
 
 
+def ribbon() -> tuple[np.ndarray, np.ndarray]:
+    """One connected open surface that cuts itself, with sharp corners: a strip bent as the letter alpha."""
+    bends = np.array([(-0.9, -0.45), (0.8, 0.35), (0.8, -0.35), (-0.9, 0.45)])
+    points = np.concatenate([np.insert(bends, 2, height, axis=1) for height in (-0.5, 0.5)])
+    faces = np.array([t for k in range(3) for t in ((k, k + 1, k + 5), (k, k + 5, k + 4))])
+    return points @ leaning((20, (0, 0, 1)), (15, (1, 0, 0))).T, faces
+
+
+def stack() -> tuple[np.ndarray, np.ndarray]:
+    """A small box on a large one, flush in front and not above its end, as parts of one mesh."""
+    points, faces = cube(1)
+    large, small = points * (0.6, 0.4, 0.3) - (0, 0, 0.3), points * (0.4, 0.25, 0.3) + (0.4, -0.15, 0.3)
+    turned = np.concatenate([large, small]) @ leaning((25, (0, 0, 1)), (10, (1, 0, 0))).T
+    return turned, np.concatenate([faces, faces + len(points)])
+
+
 def scene_of(points: np.ndarray, faces: np.ndarray) -> mi.Scene:
     """The mesh above a floor, under a lamp."""
     grey = {"type": "diffuse", "reflectance": 0.7}
@@ -63,6 +81,15 @@ def test_bodies_of_one_mesh_that_cut_into_each_other(llvm):
     slope = gain(forward(motion, SPEC, SEEDS, SPP), reference[0::2], reference[1::2])
     assert slope.stderr < 0.01, slope
     assert abs(slope.value - 1) < max(TOLERANCE, 3 * slope.stderr), slope
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [stack, ribbon])
+def test_flush_bodies_and_a_surface_that_cuts_itself(llvm, shape):
+    """What two edges of a stack have in common is one edge; deep in a sharp corner it is not dark."""
+    motion = perturb(scene_of(*shape()), *MOVED)
+    reference = fd(motion, SPEC, STEP, SEEDS, 4 * SPP)
+    assert_grad_close(forward(motion, SPEC, SEEDS, SPP), reference, 0.01)
 
 
 def test_a_mesh_that_is_mirrored_between_two_calls(llvm):

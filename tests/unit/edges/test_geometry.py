@@ -119,3 +119,18 @@ def test_result_is_detached():
     dr.enable_grad(positions)
     edge = edge_geometry(positions, mi.Vector3u(np.ascontiguousarray(f.T.astype(np.uint32))), topology)
     assert not dr.grad_enabled(edge.p0, edge.n0, edge.n1, edge.length, edge.angle)
+
+
+@pytest.mark.parametrize(("degrees", "size"), [(20, 1.0), (60, 1.0), (60, 0.1), (89, 1.0), (120, 1.0)])
+def test_faces_are_looked_at_in_front_of_each_other(degrees, size):
+    """In a corner between two faces, a ray that Mitsuba lifts off one of them does not start behind the other."""
+    φ = np.deg2rad(degrees)
+    p = size * np.array([(0, 0, 0), (0, 1, 0), (1, 0.5, 0), (np.cos(φ), 0.5, np.sin(φ))])
+    topology, edge = on_device(p, np.array([(0, 1, 2), (1, 0, 3)]))
+    row = int(np.flatnonzero(~topology.border)[0])
+    inset, n0, n1 = np.array(edge.inset0)[row], np.array(edge.n0).T[row], np.array(edge.n1).T[row]
+    start = (1 - inset) * p[:2].mean(0) + inset * p[:3].mean(0)
+    sides = [np.sign((p[3] - p[0]) @ n0), np.sign((p[2] - p[0]) @ n1)]  # of the faces that look at each other
+    lifted = start + 8.9e-5 * (1 + size) * sides[0] * n0
+    assert sides[1] * (lifted - p[0]) @ n1 > 0
+    assert inset < 0.5 and (degrees < 90 or inset == pytest.approx(3e-4))

@@ -131,3 +131,18 @@ def test_two_fine_balls():
     # segments of which an end is within the tolerance of a corner are left out: 1.4 % at this fineness
     assert length(found) == pytest.approx(2 * np.pi * 0.8, rel=2e-2)
     assert np.abs(found.start[:, 0] - 0.6).max() < 2e-3
+
+
+def test_one_surface_that_cuts_itself():
+    """A strip bent as the letter alpha crosses itself in a straight line; a fold does so from a shared corner on."""
+    bends = np.array([(-1, -0.5), (1, 0.5), (1, -0.5), (-1, 0.5)])
+    strip = np.concatenate([np.insert(bends, 2, height, axis=1) for height in (-0.4, 0.4)])
+    faces = np.array([t for k in range(3) for t in ((k, k + 1, k + 5), (k, k + 5, k + 4))])
+    found = cut.mesh_itself(mesh(strip, faces))
+    assert length(found) == pytest.approx(0.8, abs=1e-9)
+    assert np.allclose(np.concatenate([found.start, found.end])[:, :2], 0)
+    open_strip = cut.mesh_itself(mesh(strip * [1, 1, 1] + np.repeat([[0, 0, 0], [0.1, 0, 0]], 4, 0), faces[:4]))
+    assert len(open_strip.face_a) == 0
+    fold = np.array([(0, 0, 0), (2, -1, 0), (2, 1, 0), (1, 0, -1), (1, 0, 1)], float)
+    found = cut.mesh_itself(mesh(fold, np.array([(0, 1, 2), (0, 3, 4)])))
+    assert len(found.face_a) == 1 and length(found) == pytest.approx(1)

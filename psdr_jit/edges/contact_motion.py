@@ -1,0 +1,100 @@
+"""Shapes that lie flush and are moved apart, or into each other: there the image has a kink, in general.
+
+One way a gap opens, through which one looks into the dark; the other way one shape sinks into the other, and the line
+where they meet stays where it is. The terms see neither of the two: for them the edge moves over what it rests on.
+Sliding along the contact is fine. Needs the direction of the derivative, which only forward mode has.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.ad import tangents
+from ..core.compat import mesh_positions
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+from ..plan.job import Job
+from .contacts import Contact
+from .intersections import TriangleMesh, barycentric
+from .solids import Solid, triangles
+from .touching import Resting
+
+#: Relative speed that counts as parting, relative to the largest speed of the two shapes: rounding is far below.
+PARTING = 1e-3
+
+#: Distance at which a derivative is that of shapes apart, relative to 1 + the largest coordinate: ten times the height
+#: at which Mitsuba starts rays above surfaces.
+CLEAR = 1e-3
+
+
+def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
+    """Name the shapes whose contact the motion opens, each pair once."""
+    if job.call.mode != "forward" or dr.flag(dr.JitFlag.FreezingScope):
+        return
+    velocities: dict[int, np.ndarray] = {}
+    for contact in contacts:
+        if not (contact.a.moves or contact.b.moves):
+            continue
+        for solid in (contact.a, contact.b):
+            if solid.index not in velocities:
+                velocities[solid.index] = _velocities(solid)
+        if _parts(contact, velocities):
+            names = [f"'{solid.mesh.id()}'" for solid in (contact.a, contact.b)]
+            what = f"parts of shape {names[0]}" if contact.a is contact.b else f"shapes {names[0]} and {names[1]}"
+            warn_once(
+                f"flush contact: {what} touch, and the motion parts them or presses them into each other. To one side "
+                "a gap opens, to the other it does not: in general the image has a kink here and no derivative, and "
+                "what is computed is that of neither side. Lift or sink one of them by "
+                f"{CLEAR * (1 + job.facts.reach):.1g} units, or slide it along the contact",
+                UnsupportedWarning,
+                job.call.memory,
+            )
+
+
+def _velocities(solid: Solid) -> np.ndarray:
+    """(V, 3) of the vertices."""
+    with dr.resume_grad():
+        found = tangents(mesh_positions(solid.mesh))
+    return np.array(mi.Vector3f(found), float).T
+
+
+def _parts(contact: Contact, velocities: dict[int, np.ndarray]) -> bool:
+    """Is there a common edge or a contact at which the two move against each other, not just along it?"""
+    (a, v_a), (b, v_b) = ((triangles(s), velocities[s.index]) for s in (contact.a, contact.b))
+    fastest = max(np.linalg.norm(v, axis=1).max() for v in (v_a, v_b))
+    if fastest == 0:
+        return False
+    s = contact.shared
+    along = a.positions[a.edges[s.a]].astype(float)
+    along = along[:, 1] - along[:, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    against = [np.zeros(1)]
+    for k in range(2):  # both ends of the common part
+        w = _on_edges(a, v_a, s.a, s.on_a[:, k]) - _on_edges(b, v_b, s.b, s.on_b[:, k])
+        against.append(np.linalg.norm(w - along * np.sum(along * w, axis=1, keepdims=True), axis=1))
+    against += [_off_faces(*pair) for pair in ((a, v_a, b, v_b, contact.a_in_b), (b, v_b, a, v_a, contact.b_in_a))]
+    return bool(np.concatenate(against).max() > PARTING * fastest)
+
+
+def _on_edges(mesh: TriangleMesh, values: np.ndarray, edge: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """`values` (V, 3) of the vertices, interpolated on edges."""
+    start, end = values[mesh.edges[edge]].astype(float).transpose(1, 0, 2)
+    return start + t[:, None] * (end - start)
+
+
+def _off_faces(
+    own: TriangleMesh, v: np.ndarray, other: TriangleMesh, v_other: np.ndarray, found: Resting
+) -> np.ndarray:
+    """Speeds at which the ends of stretches leave the faces that they lie in."""
+    corners = other.positions[other.faces[found.face]].astype(float)
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    speeds = []
+    for k in range(2):
+        x = _on_edges(own, own.positions, found.edge, found.on_edge[:, k])
+        weights = barycentric(x, corners)[..., None]
+        w = _on_edges(own, v, found.edge, found.on_edge[:, k]) - np.sum(weights * v_other[other.faces[found.face]], 1)
+        speeds.append(np.abs(np.sum(w * n, axis=1)))
+    return np.concatenate(speeds)

@@ -1,0 +1,58 @@
+"""Meshes and balls that may touch or cut into each other, and in which state they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, positions_buffer
+from .intersections import TriangleMesh
+from .overlaps import box_of
+from .parts import Part
+from .topology import EdgeTopology
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A mesh of an edge set."""
+
+    mesh: mi.Mesh
+    index: int  # in the edge set
+    moves: bool
+    topology: EdgeTopology
+    shell: mi.Float  # by edge of the topology
+    parts: tuple[Part, ...] = ()  # its connected surfaces, if there are several
+
+
+@dataclass(frozen=True)
+class Ball:
+    """An analytic sphere."""
+
+    shape: mi.Shape
+    moves: bool
+
+
+@dataclass(frozen=True)
+class State:
+    """Changes when the shape does. The buffer is kept alive, so that its index identifies it."""
+
+    key: tuple
+    buffer: mi.Float | None
+
+
+def state_of(item: Solid | Ball) -> State:
+    if isinstance(item, Ball):
+        return State((item.moves, *box_of(item.shape).ravel()), None)
+    buffer = dr.detach(positions_buffer(item.mesh))
+    return State((item.moves, item.index, buffer.index), buffer)
+
+
+def triangles(solid: Solid) -> TriangleMesh:
+    """The mesh on the host: copies of its arrays, no kernel."""
+    positions = np.array(dr.detach(positions_buffer(solid.mesh))).reshape(-1, 3)
+    faces = np.array(faces_buffer(solid.mesh)).reshape(-1, 3)
+    t = solid.topology
+    return TriangleMesh(positions, faces, np.stack([t.v0, t.v1], 1), np.stack([t.f0, t.f1], 1))
