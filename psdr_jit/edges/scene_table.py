@@ -28,9 +28,11 @@ from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
+from .kind_rod import RodEdges
 from .kind_shading import ShadingOutlines
 from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
+from .rod_rows import rod_rows
 from .rows import EdgeRows
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
@@ -64,8 +66,10 @@ def edge_table(job: Job) -> EdgeTable:
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
-    if job.tubes is not None:
-        kinds.append(TubeOutlines(job.tubes, tube_rows(job.tubes), centre))
+    if job.tubes is not None and job.tubes.splines is not None:
+        kinds.append(TubeOutlines(job.tubes.splines, tube_rows(job.tubes.splines), centre))
+    if job.tubes is not None and job.tubes.rods is not None:
+        kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)

@@ -38,14 +38,16 @@ PLUGIN_NAMES = {
 
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
-CURVE_SHAPES = frozenset({"bsplinecurve"})
-"""Tubes about splines (`scene.tubes`)."""
+CURVE_SHAPES = frozenset({"bsplinecurve", "linearcurve"})
+"""Tubes about splines and straight lines (`scene.tubes`)."""
+
+WITHOUT_MATERIAL = frozenset({"linearcurve"})
+"""Shapes whose points have no coordinates that they keep while the shape moves."""
 
 UNSUPPORTED_SHAPES = {
     "sdfgrid": "extract a mesh, for example with marching cubes",
     "ellipsoids": "use meshes",
     "ellipsoidsmesh": "use meshes",
-    "linearcurve": "tessellate the curves into a mesh",
 }
 """Shapes without an edge set: plugin -> the way out."""
 
@@ -99,9 +101,9 @@ SUPPORT = (
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
         "faces: warning"),
-    Row("rectangle, disk, sphere, cylinder, B-spline curve", "yes",
+    Row("rectangle, disk, sphere, cylinder, B-spline and linear curve", "yes",
         "stretched or sheared spheres and cylinders: error"),
-    Row("SDF grids, ellipsoids, linear curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("SDF grids, ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),

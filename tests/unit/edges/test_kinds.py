@@ -16,6 +16,7 @@ from psdr_jit.edges.kind_analytic import AnalyticCurves
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
 from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
+from psdr_jit.edges.kind_rod import RodEdges
 from psdr_jit.edges.kind_shading import ShadingOutlines
 from psdr_jit.edges.kind_tube import TubeOutlines
 from psdr_jit.edges.scene_table import scene_edges
@@ -33,6 +34,7 @@ PLACES = {  # kind: a scene that has it, and what moves there
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
     TubeOutlines: ("curve_shadow", ["blocker.control_points"]),
+    RodEdges: ("rod_shadow", ["blocker.control_points"]),
 }
 
 

@@ -323,7 +323,7 @@ def exotic_shapes(folder):
     }
 
 
-@pytest.mark.parametrize("plugin", ["sdfgrid", "ellipsoids", "ellipsoidsmesh", "linearcurve"])
+@pytest.mark.parametrize("plugin", ["sdfgrid", "ellipsoids", "ellipsoidsmesh"])
 def test_shapes_without_edges(plugin, tmp_path):
     objects = exotic_shapes(tmp_path)[plugin]
     for moving in ("floor.to_world", "lamp.position", CAMERA):
