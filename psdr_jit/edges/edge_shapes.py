@@ -26,7 +26,18 @@ class EdgeShapes:
     """Shapes with a surface of their own."""
 
     shapes: tuple[mi.Shape, ...]  # by `ShapeFacts.index`; those of the scene come first
-    facts: tuple[ShapeFacts, ...]  # of all but the instances themselves
+    facts: tuple[ShapeFacts, ...]  # of all but grids and the instances themselves
+    grids: tuple[GridPlace, ...]  # grids of signed distances, which are not copied
+
+
+@dataclass(frozen=True)
+class GridPlace:
+    """A grid of signed distances, by itself or as an instance shows it."""
+
+    shape: mi.Shape
+    facts: ShapeFacts
+    instance: mi.Shape | None
+    place: int  # of the shape in the group of the instance
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,8 @@ def edge_shapes(job: Job) -> EdgeShapes:
 
 def _found(job: Job) -> EdgeShapes:
     shapes = list(job.scene.shapes())
-    facts = [s for s in job.facts.shapes if s.index >= 0 and s.kind != "instance"]
+    facts = [s for s in job.facts.shapes if s.index >= 0 and s.kind not in ("instance", "grid")]
+    grids = [GridPlace(shapes[s.index], s, None, 0) for s in job.facts.shapes if s.index >= 0 and s.kind == "grid"]
     instances = [s.index for s in job.facts.shapes if s.index >= 0 and s.kind == "instance"]
     if instances:
         groups = shape_groups(traverse(job.scene).hierarchy)
@@ -65,10 +77,13 @@ def _found(job: Job) -> EdgeShapes:
         for index in instances:
             name = _group(job.call.memory, index, shapes[index], groups)
             for place, (child, of_child) in enumerate(zip(groups[name], members[name], strict=True)):
+                if of_child.kind == "grid":
+                    grids.append(GridPlace(child, of_child, shapes[index], place))
+                    continue
                 copy = _copy(job, (index, place), shapes[index], child, of_child)
                 facts.append(replace(of_child, name=copy.id(), group="", index=len(shapes)))
                 shapes.append(copy)
-    return EdgeShapes(tuple(shapes), tuple(facts))
+    return EdgeShapes(tuple(shapes), tuple(facts), tuple(grids))
 
 
 def _group(memory: Memory, index: int, instance: mi.Shape, groups: dict[str, list[mi.Shape]]) -> str:

@@ -23,9 +23,11 @@ from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
+from .grid_steps import stepped_grids
 from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
+from .kind_grid import GridEdges
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
 from .kind_rod import RodEdges
@@ -34,6 +36,7 @@ from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rod_rows import rod_rows
 from .rows import EdgeRows
+from .scene_grids import scene_grids
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
@@ -70,6 +73,10 @@ def edge_table(job: Job) -> EdgeTable:
         kinds.append(TubeOutlines(job.tubes.splines, tube_rows(job.tubes.splines), centre))
     if job.tubes is not None and job.tubes.rods is not None:
         kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
+    grids = scene_grids(job)
+    if grids is not None:
+        stepped = stepped_grids(grids, job.call.memory)
+        kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)

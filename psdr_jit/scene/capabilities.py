@@ -41,7 +41,10 @@ ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 CURVE_SHAPES = frozenset({"bsplinecurve", "linearcurve"})
 """Tubes about splines and straight lines (`scene.tubes`)."""
 
-WITHOUT_MATERIAL = frozenset({"linearcurve"})
+GRID_SHAPES = frozenset({"sdfgrid"})
+"""Isosurfaces of values on a grid."""
+
+WITHOUT_MATERIAL = frozenset({"linearcurve", "sdfgrid"})
 """Shapes whose points have no coordinates that they keep while the shape moves."""
 
 UNSUPPORTED_SHAPES = {

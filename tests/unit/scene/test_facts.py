@@ -305,7 +305,7 @@ def test_specular_lobes_beside_an_instance():
     group = {"type": "shapegroup", "id": "group", "inner": {"type": "cube"}}
     objects = {"group": group, "copy": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
     facts = facts_of(load(ball={**BALL, "bsdf": {"type": "dielectric"}}, **objects), "floor.to_world")
-    with pytest.raises(UnsupportedError, match="has an instance or a curve, 'copy', beside it"):
+    with pytest.raises(UnsupportedError, match="has an instance, a curve or a grid, 'copy', beside it"):
         require_supported(facts)
 
 
