@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.compat import mesh_buffers
 from ..core.memory import Memory, Slot
@@ -38,6 +39,23 @@ class GridPlace:
     facts: ShapeFacts
     instance: mi.Shape | None
     place: int  # of the shape in the group of the instance
+
+    def id(self) -> str:
+        return self.facts.name if self.instance is None else f"{self.instance.id()}: {self.facts.name}"
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        return (self.shape if self.instance is None else self.instance).bbox()
+
+    def is_mesh(self) -> bool:
+        return False
+
+    def to_world(self) -> np.ndarray:
+        """Of the unit cube that the grid fills, (4, 4)."""
+        matrix = np.eye(4)
+        for shape in (self.instance, self.shape):
+            if shape is not None:
+                matrix = matrix @ np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
+        return matrix
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.grids import TO_WORLD, VALUES
 from .grid_rows import OUTLINE
-from .grid_set import TO_WORLD, VALUES, Frame, GridRows, GridSet, cells_of
+from .grid_set import Frame, GridRows, GridSet, cells_of
 
 #: Least sin² of the angle between surface and face that counts: where both are one, the edge does not move across it.
 ALIGNED = 1e-6

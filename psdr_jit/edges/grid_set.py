@@ -11,11 +11,9 @@ import numpy as np
 from ..core.sdf_cell import Cell
 from ..core.surface_code import INSTANCED, PART_SHIFT, parts_are_shapes
 from ..core.upload import uploaded
+from ..scene.grids import VALUES
 from .edge_shapes import GridPlace
 from .grid_rows import GridPieces, grid_pieces
-
-#: Parameters of a grid.
-VALUES, TO_WORLD = "grid", "to_world"
 
 
 @dataclass
@@ -146,7 +144,7 @@ def grid_set(places: tuple[GridPlace, ...]) -> GridSet | None:
         values.append(grid.ravel())
         size.append(grid.shape[0])
         pieces.append(found)
-        matrix = _matrix(place)
+        matrix = place.to_world()
         columns.append(matrix[:3].T)
         inverse.append(np.linalg.inv(matrix[:3, :3]))
     return GridSet(
@@ -159,15 +157,6 @@ def grid_set(places: tuple[GridPlace, ...]) -> GridSet | None:
         _vectors(np.stack(columns)),
         _vectors(np.stack(inverse)),
     )
-
-
-def _matrix(place: GridPlace) -> np.ndarray:
-    """Of the unit cube to the world, (4, 4)."""
-    matrix = np.eye(4)
-    for shape in (place.instance, place.shape):
-        if shape is not None:
-            matrix = matrix @ np.array(dr.detach(mi.traverse(shape)[TO_WORLD].matrix), float).reshape(4, 4)
-    return matrix
 
 
 def _code(place: GridPlace) -> int:

@@ -7,8 +7,9 @@ import mitsuba as mi
 
 from ..core.memory import Slot
 from ..plan.job import Job
+from ..scene.grids import TO_WORLD, VALUES
 from .edge_shapes import GridPlace, edge_shapes
-from .grid_set import TO_WORLD, VALUES, GridSet, grid_set
+from .grid_set import GridSet, grid_set
 
 #: Of an integrator: what grids were made from, and these grids.
 KNOWN: Slot[tuple[list, GridSet] | None] = Slot(lambda: None)

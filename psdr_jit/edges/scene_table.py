@@ -19,11 +19,11 @@ from ..core.upload import uploaded
 from ..core.varying import varying
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
+from ..scene.grids import blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
-from .grid_steps import stepped_grids
 from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
@@ -60,9 +60,11 @@ def edge_table(job: Job) -> EdgeTable:
     """All edges of the scene, those that no path can reach left out."""
     shapes, chosen = edge_shapes(job).shapes, edge_shapes(job).facts
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if s.plugin in CURVES_OF]
-    pairs = crossing([box_of(shapes[s.index]) for s in chosen])
-    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
-    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
+    bodies = [(shapes[s.index], s.plugin) for s in chosen]
+    bodies += [(place, place.facts.plugin) for place in edge_shapes(job).grids]
+    pairs = crossing([box_of(body) for body, _ in bodies])
+    warn_about_pairs(bodies, pairs, job.call.memory)
+    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair}) if k < len(chosen)]
     centre = varying(mi.Point3f, list(job.scene.bbox().center()))
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     kinds, hidden = _between_faces(job, _edge_set(job, meshes, balls), meshes, overlapping, centre)
@@ -75,7 +77,7 @@ def edge_table(job: Job) -> EdgeTable:
         kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
     grids = scene_grids(job)
     if grids is not None:
-        stepped = stepped_grids(grids, job.call.memory)
+        stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]
         kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..core.compat import CONTROL_POINTS, mesh_faces, mesh_positions
 from ..core.tube_axis import Axis
-from ..scene.capabilities import CURVE_SHAPES
+from ..scene.capabilities import CURVE_SHAPES, GRID_SHAPES
+from .grid_triangles import grid_triangles
 from .intersections import cross, tolerance
 
 #: Corners of a tessellated circle; rings of a sphere are half as many.
@@ -40,6 +41,8 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
     """(F, 3, 3) in world space; radii of circles grow by the factor `outward`."""
     if shape.is_mesh():
         return np.array(dr.detach(mesh_positions(shape)), float).T[np.array(mesh_faces(shape)).T]
+    if plugin in GRID_SHAPES:
+        return grid_triangles(shape.shape, shape.to_world())
     if plugin in CURVE_SHAPES:
         return _quads(_tube(shape, outward) if plugin == "bsplinecurve" else _rods(shape, outward))
     to_world = np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)

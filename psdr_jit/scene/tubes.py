@@ -15,10 +15,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import CONTROL_POINTS
+from ..core.memory import Memory
 from ..core.rod import Rod
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
 from .facts import SceneFacts, ShapeFacts
+from .grids import MovingGrid, moving_grids
 
 T = TypeVar("T", bound="Segments")
 
@@ -89,19 +91,21 @@ class Rods(Segments):
 
 @dataclass(frozen=True)
 class Tubes:
-    """The curves of a scene."""
+    """The curves of a scene, and what else has a surface that is not Mitsuba's to evaluate."""
 
     splines: Splines | None
     rods: Rods | None
+    grids: list[MovingGrid]
 
 
-def tubes_of(scene: mi.Scene, facts: SceneFacts) -> Tubes | None:
-    """The curves of `scene`; None if there are none."""
+def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
+    """The curves and moving grids of `scene`; None if there are none."""
     curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
-    if not curves:
+    grids = moving_grids(scene, facts, memory)
+    if not curves and not grids:
         return None
     of = {plugin: [s for s in curves if s.plugin == plugin] for plugin in ("bsplinecurve", "linearcurve")}
-    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]))
+    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids)
 
 
 def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | None:

@@ -13,6 +13,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_grid import GridEdges
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
 from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
@@ -35,6 +36,7 @@ PLACES = {  # kind: a scene that has it, and what moves there
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
     TubeOutlines: ("curve_shadow", ["blocker.control_points"]),
     RodEdges: ("rod_shadow", ["blocker.control_points"]),
+    GridEdges: ("grid_shadow", ["blocker.to_world"]),
 }
 
 

@@ -315,7 +315,7 @@ def exotic_shapes(folder):
     one = {"centers": mi.TensorXf([[0, 0, 0]]), "scales": mi.TensorXf([[1, 1, 1]]),
            "quaternions": mi.TensorXf([[0, 0, 0, 1]])}  # fmt: skip
     return {
-        "sdfgrid": {"x": {"type": "sdfgrid", "grid": mi.TensorXf([-1.0, 1] * 4, (2, 2, 2, 1))}},
+        "sdfgrid": {"x": {"type": "sdfgrid", "grid": mi.TensorXf([-1.0, 1] * 6, (3, 2, 2, 1))}},  # uneven
         "ellipsoids": {"x": {"type": "ellipsoids", **one}},
         "ellipsoidsmesh": {"x": {"type": "ellipsoidsmesh", **one}},
         "bsplinecurve": {"x": {"type": "bsplinecurve", "filename": str(curve)}},
