@@ -70,6 +70,11 @@ BOX_FACES = np.array([
 
 TORUS_VALUES, TORUS_RADIUS, TORUS_THICKNESS = 12, 0.29, 0.13
 
+ELLIPSOIDS = (
+    (-0.6, 0.1, 0.2, -1.0, -1.7, -2.2, 0.8, 0.0, 0.6, 0.0),
+    (0.5, -0.2, 0.0, -1.4, -1.9, -1.2, 0.5, 0.5, 0.5, 0.5),
+)
+
 PROFILE_POINTS, PROFILE_RADIUS, PROFILE_HEIGHT = 100, 0.8, 0.6
 PROFILE_WAVES = ((2, 0.08, 0.4), (3, 0.10, 1.0), (5, 0.12, 0.0), (8, 0.03, 2.0))  # around: count, amplitude, phase
 BALL_ROUNDS, BALL_RADIUS = 3, 0.75
@@ -367,11 +372,20 @@ def write_vol(path: Path, values: np.ndarray) -> None:
     path.write_bytes(header + np.array([0, 0, 0, 1, 1, 1], "<f4").tobytes() + values.astype("<f4").tobytes())
 
 
+def write_ellipsoids(path: Path, rows: np.ndarray) -> None:
+    """Centre, logarithms of the half axes, quaternion, as Mitsuba's `ellipsoids` reads them; (K, 10)."""
+    names = [*"xyz", "nx", "ny", "nz", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode("ascii") + np.insert(rows, [3, 3, 3], 0, axis=1).astype("<f4").tobytes())
+
+
 def main() -> None:
     makers = {"branching": branching, "occluders": occluders, "extruded": extruded, "ball": ball, "knob": knob}
     for name, make in makers.items():
         write_ply(MESHES / f"{name}.ply", *make())
     write_vol(MESHES / "torus.vol", torus_values())
+    write_ellipsoids(MESHES / "ellipsoids.ply", np.array(ELLIPSOIDS))
 
 
 if __name__ == "__main__":

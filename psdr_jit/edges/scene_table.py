@@ -27,6 +27,7 @@ from .edge_shapes import edge_shapes
 from .junctions import Ball
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
+from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
 from .kind_grid import GridEdges
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
@@ -75,6 +76,9 @@ def edge_table(job: Job) -> EdgeTable:
         kinds.append(TubeOutlines(job.tubes.splines, tube_rows(job.tubes.splines), centre))
     if job.tubes is not None and job.tubes.rods is not None:
         kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
+    if job.tubes is not None and job.tubes.ellipsoids is not None:
+        kinds.append(EllipsoidOutlines(job.tubes.ellipsoids, centre))
+        warn_about_touching(job.tubes.ellipsoids, job.call.memory)
     grids = scene_grids(job)
     if grids is not None:
         stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]

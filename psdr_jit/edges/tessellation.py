@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import CONTROL_POINTS, mesh_faces, mesh_positions
+from ..core.ellipsoid import Ellipsoid
 from ..core.tube_axis import Axis
-from ..scene.capabilities import CURVE_SHAPES, GRID_SHAPES
+from ..scene.capabilities import CURVE_SHAPES, ELLIPSOID_SHAPES, GRID_SHAPES
 from .grid_triangles import grid_triangles
 from .intersections import cross, tolerance
 
@@ -43,6 +44,8 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
         return np.array(dr.detach(mesh_positions(shape)), float).T[np.array(mesh_faces(shape)).T]
     if plugin in GRID_SHAPES:
         return grid_triangles(shape.shape, shape.to_world())
+    if plugin in ELLIPSOID_SHAPES:
+        return _quads(_ellipsoids(shape, outward))
     if plugin in CURVE_SHAPES:
         return _quads(_tube(shape, outward) if plugin == "bsplinecurve" else _rods(shape, outward))
     to_world = np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
@@ -72,6 +75,22 @@ def _tube(shape: mi.Shape, outward: float) -> np.ndarray:
         turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
         ring = c + outward * r[:, None] * (a * np.cos(turn) + b * np.sin(turn))  # segments, 3, corners
         rings.append(ring.swapaxes(1, 2))
+    return np.stack(rings)
+
+
+def _ellipsoids(shape: mi.Shape, outward: float) -> np.ndarray:
+    """Circles of latitude of all ellipsoids of a shape: (rings, ellipsoids, corners + 1, 3)."""
+    params = mi.traverse(shape)
+    data = dr.detach(params["data"])
+    first = dr.arange(mi.UInt32, dr.width(data) // 10) * 10
+    bodies = Ellipsoid.of([dr.gather(mi.Float, data, first + k) for k in range(10)], mi.Float(params["extent"]))
+    c = np.array(bodies.c, float).T
+    axes = [np.array(bodies.vector(mi.Vector3f(*m)) + 0 * bodies.c, float).T for m in np.eye(3)]
+    turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
+    rings = []
+    for polar in np.linspace(0, np.pi, TUBE_CORNERS // 2 + 1):
+        m = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar) + 0 * turn])
+        rings.append(c[:, None] + outward * sum(axes[k][:, None] * m[k][:, None] for k in range(3)))
     return np.stack(rings)
 
 

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from ..core.tube_axis import Axis
 from ..scene.tubes import Splines, Tubes
+from .ellipsoid_surface import ellipsoid_surface
 from .grid_surface import grid_surface
 from .rod_surface import rod_surface
 
@@ -31,7 +32,7 @@ def surface_at(
     """
     if tubes is None:
         return pi.compute_surface_interaction(ray, flags, active)
-    families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface)]
+    families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
     families += [(grid, grid_surface) for grid in tubes.grids]
     met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
     elsewhere = active

@@ -44,12 +44,15 @@ CURVE_SHAPES = frozenset({"bsplinecurve", "linearcurve"})
 GRID_SHAPES = frozenset({"sdfgrid"})
 """Isosurfaces of values on a grid."""
 
-WITHOUT_MATERIAL = frozenset({"linearcurve", "sdfgrid"})
+ELLIPSOID_SHAPES = frozenset({"ellipsoids"})
+"""Many ellipsoids as one shape."""
+
+WITHOUT_MATERIAL = frozenset({"linearcurve", "sdfgrid", "ellipsoids"})
 """Shapes whose points have no coordinates that they keep while the shape moves."""
 
 UNSUPPORTED_SHAPES = {
     "sdfgrid": "give its grid as many values along each axis, as Mitsuba mixes them up otherwise",
-    "ellipsoids": "use meshes",
+    "ellipsoids": "set extent_adaptive_clamping to false and do not instance them, or use meshes",
     "ellipsoidsmesh": "use meshes",
 }
 """Shapes without an edge set: plugin -> the way out."""
@@ -104,9 +107,9 @@ SUPPORT = (
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
         "faces: warning"),
-    Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid", "yes",
+    Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, SDF grids with unequal numbers of values along the axes: error"),
-    Row("ellipsoids", "error", _MOVING + "materials and radiance are fine"),
+    Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),
@@ -121,7 +124,7 @@ SUPPORT = (
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "warning",
         _MOVING + "edges of shadows, reflections and patterns that the sensor sees in them are missing, outlines are "
-        "there; beside instances, curves and SDF grids: error"),
+        "there; beside instances, curves, SDF grids and ellipsoids: error"),
     Row("reflectance, IOR, opacity or normals of a mirror, smooth glass, null or mask", "error",
         "weights and directions of delta lobes are not differentiated; diffuse_reflectance of plastic is fine"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
@@ -136,7 +139,7 @@ SUPPORT = (
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
         "the curve where they meet, also of separate parts of one mesh"),
-    Row("cylinders, disks, spheres, curves and SDF grids that cut into other shapes", "warning",
+    Row("cylinders, disks, spheres, curves, SDF grids and ellipsoids that cut into other shapes", "warning",
         "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
     Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),

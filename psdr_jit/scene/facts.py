@@ -13,7 +13,14 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, CURVE_SHAPES, GRID_SHAPES, INSTANCING, UNSUPPORTED_SHAPES
+from .capabilities import (
+    ANALYTIC_SHAPES,
+    CURVE_SHAPES,
+    ELLIPSOID_SHAPES,
+    GRID_SHAPES,
+    INSTANCING,
+    UNSUPPORTED_SHAPES,
+)
 from .delta_lobes import blends_delta, delta_lobes, lobes_not_followed, weights_of_delta_lobes
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
@@ -38,7 +45,7 @@ class ShapeFacts:
     index: int  # in scene.shapes(); -1 inside a shape group
     group: str  # id of the shape group that it is in, "" if it is in none
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic", "curve", "grid", "instance" or "unsupported"
+    kind: str  # "mesh", "analytic", "curve", "grid", "ellipsoids", "instance" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -209,6 +216,8 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         kind = "instance"
     elif plugin in GRID_SHAPES and is_cubic(graph, shape):
         kind = "grid"
+    elif plugin in ELLIPSOID_SHAPES and not group and not graph.value(shape, "extent_adaptive_clamping"):
+        kind = "ellipsoids"
     elif plugin in UNSUPPORTED_SHAPES or (group and plugin in CURVE_SHAPES):
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import CONTROL_POINTS
+from ..core.ellipsoid import Ellipsoid
 from ..core.memory import Memory
 from ..core.rod import Rod
 from ..core.tube_axis import Axis
@@ -23,6 +24,9 @@ from .facts import SceneFacts, ShapeFacts
 from .grids import MovingGrid, moving_grids
 
 T = TypeVar("T", bound="Segments")
+
+#: Parameter of ellipsoids, and how many numbers describe one of them.
+ELLIPSOID_DATA, ELLIPSOID_SIZE = "data", 10
 
 #: Of a shape that is no such curve.
 NONE = 0xFFFFFFFF
@@ -90,22 +94,45 @@ class Rods(Segments):
 
 
 @dataclass(frozen=True)
+class Ellipsoids(Segments):
+    """Ellipsoids: a "segment" is one of them, and its control points are the ten numbers that describe it."""
+
+    extent: mi.Float  # by shape: factor on the half axes
+
+    def ellipsoid(self, index: mi.UInt32, active: mi.Bool) -> Ellipsoid:
+        """Attached as their data are."""
+        first = dr.gather(mi.UInt32, self.first, index, active) * ELLIPSOID_SIZE
+        owner = dr.gather(mi.UInt32, self.owner, index, active)
+        data = [dr.gather(mi.Float, self.points, first + k, active) for k in range(ELLIPSOID_SIZE)]
+        for k, (shape, offset) in enumerate(zip(self.shapes, self.offsets, strict=True)):
+            flat = mi.traverse(shape)[ELLIPSOID_DATA] if self.moves[k] else None
+            if flat is not None and dr.grad_enabled(flat):
+                mine = active & (owner == k)
+                own = [dr.gather(mi.Float, flat, first - offset * ELLIPSOID_SIZE + j, mine) for j in range(10)]
+                data = [dr.select(mine, a, b) for a, b in zip(own, data, strict=True)]
+        return Ellipsoid.of(data, dr.gather(mi.Float, self.extent, owner, active))
+
+
+@dataclass(frozen=True)
 class Tubes:
     """The curves of a scene, and what else has a surface that is not Mitsuba's to evaluate."""
 
     splines: Splines | None
     rods: Rods | None
     grids: list[MovingGrid]
+    ellipsoids: Ellipsoids | None
 
 
 def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
     """The curves and moving grids of `scene`; None if there are none."""
     curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
     grids = moving_grids(scene, facts, memory)
-    if not curves and not grids:
+    ellipsoids = [s for s in facts.shapes if s.kind == "ellipsoids" and s.index >= 0]
+    if not curves and not grids and not ellipsoids:
         return None
     of = {plugin: [s for s in curves if s.plugin == plugin] for plugin in ("bsplinecurve", "linearcurve")}
-    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids)
+    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids,
+                 _table(Ellipsoids, scene, ellipsoids))  # fmt: skip
 
 
 def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | None:
@@ -118,9 +145,14 @@ def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | No
     first, owner, offsets, points, segments = [], [], [], [], 0
     for k, (facts_of, shape) in enumerate(zip(chosen, shapes, strict=True)):
         params = mi.traverse(shape)
-        own = np.array(params["segment_indices"], np.uint32)
-        offsets.append(sum(dr.width(p) for p in points) // 4)
-        points.append(dr.detach(params[CONTROL_POINTS]))
+        if family is Ellipsoids:
+            stride, of_shape = ELLIPSOID_SIZE, params[ELLIPSOID_DATA]
+            own = np.arange(dr.width(of_shape) // stride, dtype=np.uint32)
+        else:
+            stride, of_shape = 4, params[CONTROL_POINTS]
+            own = np.array(params["segment_indices"], np.uint32)
+        offsets.append(sum(dr.width(p) for p in points) // stride)
+        points.append(dr.detach(of_shape))
         first.append(own + offsets[-1])
         owner.append(np.full(len(own), k))
         start[ids[facts_of.index]], count[ids[facts_of.index]] = segments, len(own)
@@ -130,5 +162,6 @@ def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | No
     tables = [uploaded(mi.UInt32, np.concatenate(a)) for a in (first, owner)]
     moves = tuple(s.moves for s in chosen)
     pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
+    extents = [np.array([mi.traverse(shape)["extent"] for shape in shapes])] if family is Ellipsoids else []
     return family(tuple(shapes), pointers, moves, uploaded(mi.UInt32, start), uploaded(mi.UInt32, count), *tables,
-                 tuple(offsets), flat)  # fmt: skip
+                  tuple(offsets), flat, *(uploaded(mi.Float, a) for a in extents))  # fmt: skip

@@ -19,6 +19,7 @@ CASES = {  # what moves: (scene, parameter, terms whose derivative is not zero)
     "cylinder": ("cylinder_outline", "tube.to_world", {"primary"}),
     "curve": ("curve_shadow", "blocker.control_points", {"interior", "primary", "direct"}),
     "linear-curve": ("rod_shadow", "blocker.control_points", {"interior", "primary", "direct"}),
+    "ellipsoids": ("ellipsoids_shadow", "blocker.data", {"interior", "primary", "direct"}),
     "grid": ("grid_shadow", "blocker.grid", {"interior", "primary", "direct"}),
     "camera-pose": ("lit_box", "camera.to_world", {"interior", "primary"}),
     "camera-fov": ("lit_box", "camera.x_fov", {"interior", "primary"}),

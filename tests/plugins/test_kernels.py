@@ -22,8 +22,15 @@ def test_later_calls_compile_nothing(llvm, mode, form):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "param"), [("rod_shadow", "blocker.control_points"), ("grid_shadow", "blocker.grid"),
-                                             ("grid_shadow", "camera.to_world")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "param"),
+    [
+        ("rod_shadow", "blocker.control_points"),
+        ("grid_shadow", "blocker.grid"),
+        ("grid_shadow", "camera.to_world"),
+        ("ellipsoids_shadow", "camera.to_world"),
+    ],
+)
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test_curves_and_grids_compile_nothing_later(llvm, mode, name, param):
     scene = scene_io.load_scene(scene_io.shipped_scene(f"{name}.xml"), res=16)
