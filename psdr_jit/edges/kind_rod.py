@@ -117,26 +117,39 @@ class RodEdges(ContourKind):
         return sight.at.x + dr.select(is_crease, -sight.offset * sight.ω, sight.offset * sight.n_perp)
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
-        """The curve itself on the side −n_perp, and whatever a ray meets on the other; both sides of a crease are met.
-
-        The curve is never shot at at its outline: what it looks like there is known better than a ray meets it.
+        """The curve itself on the side −n_perp, and whatever a ray meets on the other; on both sides of a crease, it is
+        the curve. It is never shot at: what it looks like there is known better than a ray meets it.
         """
         rows = dr.gather(RodRows, self.rows, row, active)
         is_crease = rows.part == CREASE
-        known = (which == 0) & ~is_crease
+        known = (which == 0) | is_crease
         rod = self.rods.rod(rows.segment, active)
         v = dr.select(rows.part == SIDE, rows.start + sight.at.t * rows.length, dr.select(rows.side > 0, 1.0, 0.0))
         n = dr.normalize(mi.Vector3f(sight.at.local) - TURN * sight.ω)
         x = mi.Point3f(rod.centre(v) + rod.radius(v) * n)
+        x_crease, segment = self._beside_crease(rows, rod, sight, which, active & is_crease)
+        x, segment = dr.select(is_crease, x_crease, x), dr.select(is_crease, segment, rows.segment)
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = known & active
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
-        pi.shape = self.rods.pointer(rows.segment, pi.valid)
-        pi.prim_index = self.rods.prim_index(rows.segment, pi.valid)
-        pi.prim_uv = mi.Point2f(v, 0)
+        pi.shape = self.rods.pointer(segment, pi.valid)
+        pi.prim_index = self.rods.prim_index(segment, pi.valid)
         beside = sight.beside(which)
         ray = mi.Ray3f(dr.select(known, x - sight.r * sight.ω, beside.o), beside.d)
-        return Side(ray, pi, ~known, known | is_crease, mi.Bool(True))
+        return Side(ray, pi, ~known, known, mi.Bool(True))
+
+    def _beside_crease(
+        self, rows: RodRows, rod: Rod, sight: Sight, which: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.Point3f, mi.UInt32]:
+        """`(point, segment)` on a side of a crease: each surface leads from it to where the other turns."""
+        after, _ = self._neighbour(rows.next, active)
+        (_, n), (_, n_after) = (body.place(sight.at.x) for body in (rod, after))
+        before = (dr.dot(n_after - dr.dot(n, n_after) * n, sight.n_perp) > 0) == (which == 1)
+        normal, other = dr.select(before, n, n_after), dr.select(before, n_after, n)
+        body = dr.select(before, rod, after)
+        off = dr.normalize(other - dr.dot(normal, other) * normal)
+        v, n = body.place(sight.at.x + ASIDE * sight.at.scale * off)
+        return mi.Point3f(body.centre(v) + body.radius(v) * n), dr.select(before, rows.segment, rows.next)
 
     def shades(self, row: mi.UInt32, on: OnEdge, ω: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         return dr.gather(mi.UInt32, self.rows.part, row, active) != CREASE
