@@ -1,4 +1,4 @@
-"""Makes the larger meshes of these scenes: `python -m scenes.make_meshes`, in the folder above, rewrites them.
+"""Makes the larger meshes and grids of these scenes: `python -m scenes.make_meshes`, in the folder above, does.
 
 The curve along which parts of one mesh cut into each other is an edge that psdr_jit does not find. Hence no two
 parts touch: each keeps a gap to all before it, or is left out. All lengths are scene units.
@@ -67,6 +67,13 @@ BOX_FACES = np.array([
     (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 ])  # fmt: skip
+
+TORUS_VALUES, TORUS_RADIUS, TORUS_THICKNESS = 12, 0.29, 0.13
+
+ELLIPSOIDS = (
+    (-0.6, 0.1, 0.2, -1.0, -1.7, -2.2, 0.8, 0.0, 0.6, 0.0),
+    (0.5, -0.2, 0.0, -1.4, -1.9, -1.2, 0.5, 0.5, 0.5, 0.5),
+)
 
 PROFILE_POINTS, PROFILE_RADIUS, PROFILE_HEIGHT = 100, 0.8, 0.6
 PROFILE_WAVES = ((2, 0.08, 0.4), (3, 0.10, 1.0), (5, 0.12, 0.0), (8, 0.03, 2.0))  # around: count, amplitude, phase
@@ -353,10 +360,32 @@ def write_ply(path: Path, positions: np.ndarray, faces: np.ndarray) -> None:
     path.write_bytes(header.encode("ascii") + positions.astype("<f4").tobytes() + table.tobytes())
 
 
+def torus_values() -> np.ndarray:
+    """Signed distances to a torus in the unit cube, (z, y, x)."""
+    z, y, x = np.meshgrid(*[np.linspace(-0.5, 0.5, TORUS_VALUES)] * 3, indexing="ij")
+    return np.hypot(np.hypot(x, y) - TORUS_RADIUS, z) - TORUS_THICKNESS
+
+
+def write_vol(path: Path, values: np.ndarray) -> None:
+    """A grid of one channel in Mitsuba's format: size along x, y and z, channels, box, float32 values."""
+    header = b"VOL\x03" + np.array([1, *values.shape[::-1], 1], "<i4").tobytes()
+    path.write_bytes(header + np.array([0, 0, 0, 1, 1, 1], "<f4").tobytes() + values.astype("<f4").tobytes())
+
+
+def write_ellipsoids(path: Path, rows: np.ndarray) -> None:
+    """Centre, logarithms of the half axes, quaternion, as Mitsuba's `ellipsoids` reads them; (K, 10)."""
+    names = [*"xyz", "nx", "ny", "nz", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    path.write_bytes(header.encode("ascii") + np.insert(rows, [3, 3, 3], 0, axis=1).astype("<f4").tobytes())
+
+
 def main() -> None:
     makers = {"branching": branching, "occluders": occluders, "extruded": extruded, "ball": ball, "knob": knob}
     for name, make in makers.items():
         write_ply(MESHES / f"{name}.ply", *make())
+    write_vol(MESHES / "torus.vol", torus_values())
+    write_ellipsoids(MESHES / "ellipsoids.ply", np.array(ELLIPSOIDS))
 
 
 if __name__ == "__main__":

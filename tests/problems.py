@@ -42,6 +42,7 @@ GAUSSIAN = {"rfilter": "gaussian"}
 RGBA = {"pixel_format": "rgba"}
 HIDDEN = {"hide_emitters": True}
 DEPTH_3 = {"max_depth": 3}
+SMOOTH = {"normals": "smooth"}
 
 PROBLEMS = (
     # light that moves or changes
@@ -131,6 +132,21 @@ PROBLEMS = (
     Problem("curve_shadow", "blocker.control_points", 0.004, index=7, load=GAUSSIAN, tag="swollen", slow=True),
     Problem("curve_shadow", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
     Problem("curve_shadow", "light.to_world", 0.01, direction=X, slow=True),
+    Problem("rod_shadow", "blocker.control_points", 0.004, direction=Y, load=GAUSSIAN, slow=True),
+    Problem("rod_shadow", "blocker.control_points", 0.004, index=5, load=DEPTH_3, tag="bent", slow=True),
+    Problem("rod_shadow", "blocker.control_points", 0.004, index=7, load=GAUSSIAN, tag="swollen", slow=True),
+    Problem("rod_shadow", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
+    Problem("rod_shadow", "light.to_world", 0.01, direction=X, slow=True),
+    Problem("ellipsoids_shadow", "blocker.data", 0.004, index=1, load=GAUSSIAN, tag="moved", slow=True),
+    Problem("ellipsoids_shadow", "blocker.data", 0.004, index=18, load=DEPTH_3, tag="turned", slow=True),
+    Problem("ellipsoids_shadow", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
+    Problem("ellipsoids_shadow", "light.to_world", 0.01, direction=X, slow=True),
+    Problem("grid_shadow", "blocker.to_world", 0.004, direction=Y, load=GAUSSIAN, slow=True),
+    Problem("grid_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, tag="indirect", slow=True),
+    Problem("grid_shadow", "blocker.grid", 0.004, load=GAUSSIAN, slow=True),
+    Problem("grid_shadow", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
+    Problem("grid_shadow", "camera.to_world", 0.004, direction=Y, load=SMOOTH | GAUSSIAN, tag="smooth", slow=True),
+    Problem("grid_shadow", "light.to_world", 0.01, direction=X, slow=True),
     Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
     Problem("constant_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.compat import mesh_buffers
 from ..core.memory import Memory, Slot
@@ -26,7 +27,35 @@ class EdgeShapes:
     """Shapes with a surface of their own."""
 
     shapes: tuple[mi.Shape, ...]  # by `ShapeFacts.index`; those of the scene come first
-    facts: tuple[ShapeFacts, ...]  # of all but the instances themselves
+    facts: tuple[ShapeFacts, ...]  # of all but grids and the instances themselves
+    grids: tuple[GridPlace, ...]  # grids of signed distances, which are not copied
+
+
+@dataclass(frozen=True)
+class GridPlace:
+    """A grid of signed distances, by itself or as an instance shows it."""
+
+    shape: mi.Shape
+    facts: ShapeFacts
+    instance: mi.Shape | None
+    place: int  # of the shape in the group of the instance
+
+    def id(self) -> str:
+        return self.facts.name if self.instance is None else f"{self.instance.id()}: {self.facts.name}"
+
+    def bbox(self) -> mi.ScalarBoundingBox3f:
+        return (self.shape if self.instance is None else self.instance).bbox()
+
+    def is_mesh(self) -> bool:
+        return False
+
+    def to_world(self) -> np.ndarray:
+        """Of the unit cube that the grid fills, (4, 4)."""
+        matrix = np.eye(4)
+        for shape in (self.instance, self.shape):
+            if shape is not None:
+                matrix = matrix @ np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
+        return matrix
 
 
 @dataclass(frozen=True)
@@ -57,7 +86,8 @@ def edge_shapes(job: Job) -> EdgeShapes:
 
 def _found(job: Job) -> EdgeShapes:
     shapes = list(job.scene.shapes())
-    facts = [s for s in job.facts.shapes if s.index >= 0 and s.kind != "instance"]
+    facts = [s for s in job.facts.shapes if s.index >= 0 and s.kind not in ("instance", "grid")]
+    grids = [GridPlace(shapes[s.index], s, None, 0) for s in job.facts.shapes if s.index >= 0 and s.kind == "grid"]
     instances = [s.index for s in job.facts.shapes if s.index >= 0 and s.kind == "instance"]
     if instances:
         groups = shape_groups(traverse(job.scene).hierarchy)
@@ -65,10 +95,13 @@ def _found(job: Job) -> EdgeShapes:
         for index in instances:
             name = _group(job.call.memory, index, shapes[index], groups)
             for place, (child, of_child) in enumerate(zip(groups[name], members[name], strict=True)):
+                if of_child.kind == "grid":
+                    grids.append(GridPlace(child, of_child, shapes[index], place))
+                    continue
                 copy = _copy(job, (index, place), shapes[index], child, of_child)
                 facts.append(replace(of_child, name=copy.id(), group="", index=len(shapes)))
                 shapes.append(copy)
-    return EdgeShapes(tuple(shapes), tuple(facts))
+    return EdgeShapes(tuple(shapes), tuple(facts), tuple(grids))
 
 
 def _group(memory: Memory, index: int, instance: mi.Shape, groups: dict[str, list[mi.Shape]]) -> str:

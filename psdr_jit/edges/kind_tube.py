@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
-from ..scene.tubes import Tubes
+from ..scene.tubes import Splines
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
 from .points import INSET, clearance
@@ -43,8 +43,8 @@ class TubeRows:
     moves: mi.Bool
 
 
-def tube_rows(tubes: Tubes) -> TubeRows:
-    """Pieces of all curves."""
+def tube_rows(tubes: Splines) -> TubeRows:
+    """Pieces of all B-spline curves."""
     first, owner = (np.array(a).astype(np.int64) for a in (tubes.first, tubes.owner))
     moves = np.array(tubes.moves)[owner]
     segment = np.arange(len(first))
@@ -69,7 +69,7 @@ def _pieces(segment: np.ndarray, *values: float) -> tuple[np.ndarray, ...]:
 class TubeOutlines(ContourKind):
     """Pieces of the outlines of curves."""
 
-    tubes: Tubes
+    tubes: Splines
     rows: TubeRows
     centre: mi.Point3f  # of the scene
 

@@ -16,7 +16,7 @@ from .tessellation import cut_each_other
 SAID: Slot[set[tuple[str, str]]] = Slot(set)
 
 #: Shapes without triangles.
-ANALYTIC = ("disk", "cylinder", "sphere", "bsplinecurve")
+ANALYTIC = ("disk", "cylinder", "sphere", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids")
 
 
 def box_of(shape: mi.Shape) -> np.ndarray:

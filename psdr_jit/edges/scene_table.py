@@ -19,6 +19,7 @@ from ..core.upload import uploaded
 from ..core.varying import varying
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
+from ..scene.grids import blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .contact_motion import warn_about_parting
@@ -26,12 +27,17 @@ from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
+from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
+from .kind_grid import GridEdges
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
+from .kind_rod import RodEdges
 from .kind_shading import ShadingOutlines
 from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
+from .rod_rows import rod_rows
 from .rows import EdgeRows
+from .scene_grids import scene_grids
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
@@ -56,9 +62,11 @@ def edge_table(job: Job) -> EdgeTable:
     """All edges of the scene, those that no path can reach left out."""
     shapes, chosen = edge_shapes(job).shapes, edge_shapes(job).facts
     meshes, analytic = [s for s in chosen if s.is_mesh], [s for s in chosen if s.plugin in CURVES_OF]
-    pairs = crossing([box_of(shapes[s.index]) for s in chosen])
-    warn_about_pairs([(shapes[s.index], s.plugin) for s in chosen], pairs, job.call.memory)
-    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair})]
+    bodies = [(shapes[s.index], s.plugin) for s in chosen]
+    bodies += [(place, place.facts.plugin) for place in edge_shapes(job).grids]
+    pairs = crossing([box_of(body) for body, _ in bodies])
+    warn_about_pairs(bodies, pairs, job.call.memory)
+    overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair}) if k < len(chosen)]
     centre = varying(mi.Point3f, list(job.scene.bbox().center()))
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     straight = _edge_set(job, meshes, balls)
@@ -67,8 +75,17 @@ def edge_table(job: Job) -> EdgeTable:
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
-    if job.tubes is not None:
-        kinds.append(TubeOutlines(job.tubes, tube_rows(job.tubes), centre))
+    if job.tubes is not None and job.tubes.splines is not None:
+        kinds.append(TubeOutlines(job.tubes.splines, tube_rows(job.tubes.splines), centre))
+    if job.tubes is not None and job.tubes.rods is not None:
+        kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
+    if job.tubes is not None and job.tubes.ellipsoids is not None:
+        kinds.append(EllipsoidOutlines(job.tubes.ellipsoids, centre))
+        warn_about_touching(job.tubes.ellipsoids, job.call.memory)
+    grids = scene_grids(job)
+    if grids is not None:
+        stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]
+        kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)

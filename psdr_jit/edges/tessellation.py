@@ -7,8 +7,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import CONTROL_POINTS, mesh_faces, mesh_positions
+from ..core.ellipsoid import Ellipsoid
 from ..core.tube_axis import Axis
-from ..scene.capabilities import CURVE_SHAPES
+from ..scene.capabilities import CURVE_SHAPES, ELLIPSOID_SHAPES, GRID_SHAPES
+from .grid_triangles import grid_triangles
 from .intersections import cross, tolerance
 
 #: Corners of a tessellated circle; rings of a sphere are half as many.
@@ -40,8 +42,12 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
     """(F, 3, 3) in world space; radii of circles grow by the factor `outward`."""
     if shape.is_mesh():
         return np.array(dr.detach(mesh_positions(shape)), float).T[np.array(mesh_faces(shape)).T]
+    if plugin in GRID_SHAPES:
+        return grid_triangles(shape.shape, shape.to_world())
+    if plugin in ELLIPSOID_SHAPES:
+        return _quads(_ellipsoids(shape, outward))
     if plugin in CURVE_SHAPES:
-        return _quads(_tube(shape, outward))
+        return _quads(_tube(shape, outward) if plugin == "bsplinecurve" else _rods(shape, outward))
     to_world = np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
     turn = 2 * np.pi * np.arange(CORNERS + 1) / CORNERS
     circle = outward * np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
@@ -69,6 +75,45 @@ def _tube(shape: mi.Shape, outward: float) -> np.ndarray:
         turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
         ring = c + outward * r[:, None] * (a * np.cos(turn) + b * np.sin(turn))  # segments, 3, corners
         rings.append(ring.swapaxes(1, 2))
+    return np.stack(rings)
+
+
+def _ellipsoids(shape: mi.Shape, outward: float) -> np.ndarray:
+    """Circles of latitude of all ellipsoids of a shape: (rings, ellipsoids, corners + 1, 3)."""
+    params = mi.traverse(shape)
+    data = dr.detach(params["data"])
+    first = dr.arange(mi.UInt32, dr.width(data) // 10) * 10
+    bodies = Ellipsoid.of([dr.gather(mi.Float, data, first + k) for k in range(10)], mi.Float(params["extent"]))
+    c = np.array(bodies.c, float).T
+    axes = [np.array(bodies.vector(mi.Vector3f(*m)) + 0 * bodies.c, float).T for m in np.eye(3)]
+    turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
+    rings = []
+    for polar in np.linspace(0, np.pi, TUBE_CORNERS // 2 + 1):
+        m = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar) + 0 * turn])
+        rings.append(c[:, None] + outward * sum(axes[k][:, None] * m[k][:, None] for k in range(3)))
+    return np.stack(rings)
+
+
+def _rods(shape: mi.Shape, outward: float) -> np.ndarray:
+    """Circles about every segment of a linear curve: (rings, segments, corners + 1, 3)."""
+    params = mi.traverse(shape)
+    points = np.array(dr.detach(params[CONTROL_POINTS]), float).reshape(-1, 4)
+    first = np.array(params["segment_indices"]).astype(np.int64)
+    a, b = points[first], points[first + 1]
+    u = (b - a)[:, :3]
+    length = np.linalg.norm(u, axis=1, keepdims=True)
+    u, slope = u / length, (b - a)[:, 3:] / length
+    side = np.cross(u, np.eye(3)[np.abs(u).argmin(1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(u, side)
+    turn = 2 * np.pi * np.arange(TUBE_CORNERS + 1) / TUBE_CORNERS
+    circle = side[..., None] * np.cos(turn) + up[..., None] * np.sin(turn)  # segments, 3, corners
+    tangent = np.arccos(np.clip(-slope, -1, 1))  # angle between the axis and the normal where the cone begins
+    shares, rings = np.linspace(0, 1, TUBE_RINGS + 1), []
+    for end, angles in ((a, np.pi + (tangent - np.pi) * shares), (b, tangent * (1 - shares))):
+        for angle in angles.T:
+            n = np.cos(angle)[:, None, None] * u[..., None] + np.sin(angle)[:, None, None] * circle
+            rings.append((end[:, :3, None] + outward * end[:, 3, None, None] * n).swapaxes(1, 2))
     return np.stack(rings)
 
 

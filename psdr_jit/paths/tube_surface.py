@@ -17,7 +17,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.tube_axis import Axis
-from ..scene.tubes import Tubes
+from ..scene.tubes import Splines, Tubes
+from .ellipsoid_surface import ellipsoid_surface
+from .grid_surface import grid_surface
+from .rod_surface import rod_surface
 
 
 def surface_at(
@@ -29,18 +32,25 @@ def surface_at(
     """
     if tubes is None:
         return pi.compute_surface_interaction(ray, flags, active)
-    segment, on_tube = tubes.segment(pi, active & pi.is_valid())
-    si = pi.compute_surface_interaction(ray, flags, active & ~on_tube)
-    own = _on_tube(tubes, pi, segment, ray, int(flags) & int(mi.RayFlags.FollowShape) != 0, on_tube)
-    # field by field: a whole interaction would be selected with its instance and its differentials
-    for name in ("t", "time", "p", "n", "uv", "sh_frame", "dp_du", "dp_dv", "wi", "prim_index", "shape"):
-        setattr(si, name, dr.select(on_tube, getattr(own, name), getattr(si, name)))
+    families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
+    families += [(grid, grid_surface) for grid in tubes.grids]
+    met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
+    elsewhere = active
+    for *_, on_curve in met:
+        elsewhere &= ~on_curve
+    si = pi.compute_surface_interaction(ray, flags, elsewhere)
+    follow = int(flags) & int(mi.RayFlags.FollowShape) != 0
+    for curves, of, segment, on_curve in met:
+        own = of(curves, pi, segment, ray, follow, on_curve)
+        # field by field: a whole interaction would be selected with its instance and its differentials
+        for name in ("t", "time", "p", "n", "uv", "sh_frame", "dp_du", "dp_dv", "wi", "prim_index", "shape"):
+            setattr(si, name, dr.select(on_curve, getattr(own, name), getattr(si, name)))
     si.wavelengths = ray.wavelengths
     return si
 
 
-def _on_tube(
-    tubes: Tubes,
+def _spline_surface(
+    tubes: Splines,
     pi: mi.PreliminaryIntersection3f,
     segment: mi.UInt32,
     ray: mi.Ray3f,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..options import Options
+from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts
 
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
@@ -19,6 +20,9 @@ def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[
     """The forms that come into question, the safer one first, and the reason if there is one only."""
     if facts.geometry_moves and facts.has_delta_lobes:
         return ("spatial",), "directions follow mirrors and glass"
+    unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL]
+    if facts.geometry_moves and unmapped:
+        return ("spatial",), f"the points of '{unmapped[0]}' are not followed"
     if options.form != "auto":
         return (options.form,), "as asked for"
     if not facts.geometry_moves:

@@ -86,7 +86,7 @@ class Job:
 def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
     """The curves of the scene, read once per render call."""
     if shared[TUBES] is None:
-        shared[TUBES] = (tubes_of(call.scene, facts),)
+        shared[TUBES] = (tubes_of(call.scene, facts, call.memory),)
     return shared[TUBES][0]
 
 

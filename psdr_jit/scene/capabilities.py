@@ -39,14 +39,22 @@ PLUGIN_NAMES = {
 
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
-CURVE_SHAPES = frozenset({"bsplinecurve"})
-"""Tubes about splines (`scene.tubes`)."""
+CURVE_SHAPES = frozenset({"bsplinecurve", "linearcurve"})
+"""Tubes about splines and straight lines (`scene.tubes`)."""
+
+GRID_SHAPES = frozenset({"sdfgrid"})
+"""Isosurfaces of values on a grid."""
+
+ELLIPSOID_SHAPES = frozenset({"ellipsoids"})
+"""Many ellipsoids as one shape."""
+
+WITHOUT_MATERIAL = frozenset({"linearcurve", "sdfgrid", "ellipsoids"})
+"""Shapes whose points have no coordinates that they keep while the shape moves."""
 
 UNSUPPORTED_SHAPES = {
-    "sdfgrid": "extract a mesh, for example with marching cubes",
-    "ellipsoids": "use meshes",
+    "sdfgrid": "give its grid as many values along each axis, as Mitsuba mixes them up otherwise",
+    "ellipsoids": "set extent_adaptive_clamping to false and do not instance them, or use meshes",
     "ellipsoidsmesh": "use meshes",
-    "linearcurve": "tessellate the curves into a mesh",
 }
 """Shapes without an edge set: plugin -> the way out."""
 
@@ -112,9 +120,9 @@ SUPPORT = (
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
         "faces: warning"),
-    Row("rectangle, disk, sphere, cylinder, B-spline curve", "yes",
-        "stretched or sheared spheres and cylinders: error"),
-    Row("SDF grids, ellipsoids, linear curves", "error", _MOVING + "materials and radiance are fine"),
+    Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
+        "stretched or sheared spheres and cylinders, SDF grids with unequal numbers of values along the axes: error"),
+    Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),
@@ -128,7 +136,8 @@ SUPPORT = (
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "yes",
-        _MOVING + "beside instances and curves: error; seen in them, frames of projectors and hard rims: warning"),
+        _MOVING + "beside instances, curves, SDF grids and ellipsoids: error; seen in them, frames of projectors and "
+        "hard rims: warning"),
     Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",
         "IOR: `psdr_dielectric`, `psdr_plastic` in place of `dielectric`, `plastic`, which keep it as a plain number; "
         "behind glass as in the row above; opacity of a mask, what is under it or a bump map, normals: error"),
@@ -144,7 +153,7 @@ SUPPORT = (
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
         "the curve where they meet, also of separate parts of one mesh"),
-    Row("cylinders, disks, spheres and curves that cut into other shapes", "warning",
+    Row("cylinders, disks, spheres, curves, SDF grids and ellipsoids that cut into other shapes", "warning",
         "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
     Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),

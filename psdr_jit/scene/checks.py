@@ -158,13 +158,14 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
     """Directions follow delta lobes; what cannot be followed is refused, what is not sampled behind them is named."""
     if not facts.geometry_moves:
         return
-    beside = next((s.name for s in facts.shapes if s.kind in ("instance", "curve")), "")
+    beside = next((s.name for s in facts.shapes if s.kind in ("instance", "curve", "grid", "ellipsoids")), "")
     for shape in facts.shapes:
         if not shape.delta_lobes:
             continue
         label = f"shape '{shape.name}' has the BSDF '{shape.bsdf}' with perfectly specular or pass-through lobes"
         lobes = ", ".join(shape.delta_lobes)
-        obstacle = shape.delta_obstacle or (beside and f"the scene has an instance or a curve, '{beside}', beside it")
+        others = beside and f"the scene has an instance, a curve, a grid or ellipsoids, '{beside}', beside it"
+        obstacle = shape.delta_obstacle or others
         if obstacle:
             yield Finding(
                 UnsupportedError, shape.name,

@@ -13,11 +13,19 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
-from .capabilities import ANALYTIC_SHAPES, CURVE_SHAPES, INSTANCING, UNSUPPORTED_SHAPES
+from .capabilities import (
+    ANALYTIC_SHAPES,
+    CURVE_SHAPES,
+    ELLIPSOID_SHAPES,
+    GRID_SHAPES,
+    INSTANCING,
+    UNSUPPORTED_SHAPES,
+)
 from .delta_lobes import bending, blends_delta, delta_lobes, lobes_not_followed, lost_weights
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
+    is_cubic,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
@@ -37,7 +45,7 @@ class ShapeFacts:
     index: int  # in scene.shapes(); -1 inside a shape group
     group: str  # id of the shape group that it is in, "" if it is in none
     plugin: str  # as written in XML, for example "obj" or "sphere"
-    kind: str  # "mesh", "analytic", "curve", "instance" or "unsupported"
+    kind: str  # "mesh", "analytic", "curve", "grid", "ellipsoids", "instance" or "unsupported"
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
@@ -212,6 +220,10 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
     weights, varies = lost_weights(graph, bsdf)
     if plugin in INSTANCING:
         kind = "instance"
+    elif plugin in GRID_SHAPES and is_cubic(graph, shape):
+        kind = "grid"
+    elif plugin in ELLIPSOID_SHAPES and not group and not graph.value(shape, "extent_adaptive_clamping"):
+        kind = "ellipsoids"
     elif plugin in UNSUPPORTED_SHAPES or (group and plugin in CURVE_SHAPES):
         kind = "unsupported"
     elif plugin in ANALYTIC_SHAPES:
@@ -220,7 +232,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
-    # of the steps on a curve, none are edges
+    # of the steps on a curve, none are edges; a grid has one texture coordinate all over
     missing, jumps = (steps, jumps) if kind == "curve" else (missing_patterns(steps), missing_patterns(jumps))
     return ShapeFacts(
         name=graph.name(shape, index),

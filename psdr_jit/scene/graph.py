@@ -200,6 +200,11 @@ def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
     return matrix is not None and stretches(matrix.reshape(4, 4), plugin)
 
 
+def is_cubic(graph: SceneGraph, shape: mi.Shape) -> bool:
+    """Has a grid as many values along each axis? Mitsuba 3.9 mixes the axes up where it has not."""
+    return len(set(graph.value(shape, "grid").shape[:3])) == 1
+
+
 def stretches(matrix: np.ndarray, plugin: str) -> bool:
     """Whether this object-to-world map (4, 4) makes an ellipsoid of a sphere, or an ellipse of a cylinder's circle."""
     if plugin not in ("sphere", "cylinder"):

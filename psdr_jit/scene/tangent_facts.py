@@ -54,7 +54,7 @@ def moves_as_one(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts) -> bool:
         return False
     points, turns = [_frame_motion(sensor)], []
     for shape, facts_of in zip(scene.shapes(), facts.shapes, strict=False):
-        if facts_of.index < 0 or not facts_of.moves or facts_of.kind == "curve":
+        if facts_of.index < 0 or not facts_of.moves or facts_of.kind in ("curve", "grid", "ellipsoids"):
             return False
         points.append(_mesh_motion(shape) if facts_of.is_mesh else _frame_motion(shape))
         if facts_of.shading:

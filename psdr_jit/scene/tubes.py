@@ -1,35 +1,45 @@
 """The curves of a scene as tables: which segment a ray has met, and its control points.
 
-Mitsuba's own attached evaluation of curves is not used: its points do not stay on the surface where circles twist, and
-at the very end of a shape it reads past its segments. What is here is enough to evaluate them anew (`core.tube_axis`,
-`paths.tube_surface`).
+Mitsuba's own attached evaluation of curves is not used. Of B-splines, its points do not stay on the surface where
+circles twist, and at the very end of a shape it reads past its segments; of linear curves, it has none. What is here is
+enough to evaluate them anew (`core.tube_axis`, `core.rod`, `paths.tube_surface`, `paths.rod_surface`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.compat import CONTROL_POINTS
+from ..core.ellipsoid import Ellipsoid
+from ..core.memory import Memory
+from ..core.rod import Rod
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
-from .facts import SceneFacts
+from .facts import SceneFacts, ShapeFacts
+from .grids import MovingGrid, moving_grids
 
-#: Of a shape that is no curve.
+T = TypeVar("T", bound="Segments")
+
+#: Parameter of ellipsoids, and how many numbers describe one of them.
+ELLIPSOID_DATA, ELLIPSOID_SIZE = "data", 10
+
+#: Of a shape that is no such curve.
 NONE = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
-class Tubes:
-    """All curves of a scene, one after the other. Host object; the arrays are detached."""
+class Segments:
+    """All curves of one plugin, one after the other. Host object; the arrays are detached."""
 
     shapes: tuple[mi.Shape, ...]
     pointers: mi.ShapePtr  # to them
     moves: tuple[bool, ...]  # by shape
-    start: mi.UInt32  # by registry index of a shape: its first segment, `NONE` if it is no curve
+    start: mi.UInt32  # by registry index of a shape: its first segment, or `NONE`
     count: mi.UInt32  # likewise: how many segments it has
     first: mi.UInt32  # by segment: its first control point ...
     owner: mi.UInt32  # ... and its shape
@@ -51,10 +61,10 @@ class Tubes:
         shape = dr.reinterpret_array(mi.UInt32, self.pointer(segment, active))
         return segment - dr.gather(mi.UInt32, self.start, shape, active)
 
-    def axis(self, segment: mi.UInt32, v: mi.Float, active: mi.Bool) -> Axis:
-        """The axis at v of segments; attached to control points whose gradients are enabled."""
+    def control_points(self, segment: mi.UInt32, number: int, active: mi.Bool) -> list[mi.Vector4f]:
+        """The first `number` control points of segments; attached to those whose gradients are enabled."""
         first = dr.gather(mi.UInt32, self.first, segment, active)
-        p = [dr.gather(mi.Vector4f, self.points, first + k, active) for k in range(4)]
+        p = [dr.gather(mi.Vector4f, self.points, first + k, active) for k in range(number)]
         if any(self.moves):
             owner = dr.gather(mi.UInt32, self.owner, segment, active)
             for k, (shape, offset) in enumerate(zip(self.shapes, self.offsets, strict=True)):
@@ -62,14 +72,71 @@ class Tubes:
                 if flat is not None and dr.grad_enabled(flat):
                     mine = active & (owner == k)
                     # from each shape's own array: a gradient does not leave a loop through a concatenation
-                    own = [dr.gather(mi.Vector4f, flat, first - offset + j, mine) for j in range(4)]
+                    own = [dr.gather(mi.Vector4f, flat, first - offset + j, mine) for j in range(number)]
                     p = [dr.select(mine, a, b) for a, b in zip(own, p, strict=True)]
-        return Axis.of(p, v)
+        return p
 
 
-def tubes_of(scene: mi.Scene, facts: SceneFacts) -> Tubes | None:
-    """The curves of `scene`; None if there are none."""
-    chosen = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
+class Splines(Segments):
+    """B-spline curves."""
+
+    def axis(self, segment: mi.UInt32, v: mi.Float, active: mi.Bool) -> Axis:
+        """The axis at v of segments, attached as their control points are."""
+        return Axis.of(self.control_points(segment, 4, active), v)
+
+
+class Rods(Segments):
+    """Linear curves."""
+
+    def rod(self, segment: mi.UInt32, active: mi.Bool) -> Rod:
+        """Segments, attached as their control points are."""
+        return Rod.between(*self.control_points(segment, 2, active))
+
+
+@dataclass(frozen=True)
+class Ellipsoids(Segments):
+    """Ellipsoids: a "segment" is one of them, and its control points are the ten numbers that describe it."""
+
+    extent: mi.Float  # by shape: factor on the half axes
+
+    def ellipsoid(self, index: mi.UInt32, active: mi.Bool) -> Ellipsoid:
+        """Attached as their data are."""
+        first = dr.gather(mi.UInt32, self.first, index, active) * ELLIPSOID_SIZE
+        owner = dr.gather(mi.UInt32, self.owner, index, active)
+        data = [dr.gather(mi.Float, self.points, first + k, active) for k in range(ELLIPSOID_SIZE)]
+        for k, (shape, offset) in enumerate(zip(self.shapes, self.offsets, strict=True)):
+            flat = mi.traverse(shape)[ELLIPSOID_DATA] if self.moves[k] else None
+            if flat is not None and dr.grad_enabled(flat):
+                mine = active & (owner == k)
+                own = [dr.gather(mi.Float, flat, first - offset * ELLIPSOID_SIZE + j, mine) for j in range(10)]
+                data = [dr.select(mine, a, b) for a, b in zip(own, data, strict=True)]
+        return Ellipsoid.of(data, dr.gather(mi.Float, self.extent, owner, active))
+
+
+@dataclass(frozen=True)
+class Tubes:
+    """The curves of a scene, and what else has a surface that is not Mitsuba's to evaluate."""
+
+    splines: Splines | None
+    rods: Rods | None
+    grids: list[MovingGrid]
+    ellipsoids: Ellipsoids | None
+
+
+def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
+    """The curves and moving grids of `scene`; None if there are none."""
+    curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
+    grids = moving_grids(scene, facts, memory)
+    ellipsoids = [s for s in facts.shapes if s.kind == "ellipsoids" and s.index >= 0]
+    if not curves and not grids and not ellipsoids:
+        return None
+    of = {plugin: [s for s in curves if s.plugin == plugin] for plugin in ("bsplinecurve", "linearcurve")}
+    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids,
+                 _table(Ellipsoids, scene, ellipsoids))  # fmt: skip
+
+
+def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | None:
+    """The shapes `chosen`; None if there are none."""
     if not chosen:
         return None
     shapes = [scene.shapes()[s.index] for s in chosen]
@@ -78,9 +145,14 @@ def tubes_of(scene: mi.Scene, facts: SceneFacts) -> Tubes | None:
     first, owner, offsets, points, segments = [], [], [], [], 0
     for k, (facts_of, shape) in enumerate(zip(chosen, shapes, strict=True)):
         params = mi.traverse(shape)
-        own = np.array(params["segment_indices"], np.uint32)
-        offsets.append(sum(dr.width(p) for p in points) // 4)
-        points.append(dr.detach(params[CONTROL_POINTS]))
+        if family is Ellipsoids:
+            stride, of_shape = ELLIPSOID_SIZE, params[ELLIPSOID_DATA]
+            own = np.arange(dr.width(of_shape) // stride, dtype=np.uint32)
+        else:
+            stride, of_shape = 4, params[CONTROL_POINTS]
+            own = np.array(params["segment_indices"], np.uint32)
+        offsets.append(sum(dr.width(p) for p in points) // stride)
+        points.append(dr.detach(of_shape))
         first.append(own + offsets[-1])
         owner.append(np.full(len(own), k))
         start[ids[facts_of.index]], count[ids[facts_of.index]] = segments, len(own)
@@ -90,5 +162,6 @@ def tubes_of(scene: mi.Scene, facts: SceneFacts) -> Tubes | None:
     tables = [uploaded(mi.UInt32, np.concatenate(a)) for a in (first, owner)]
     moves = tuple(s.moves for s in chosen)
     pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
-    return Tubes(tuple(shapes), pointers, moves, uploaded(mi.UInt32, start), uploaded(mi.UInt32, count), *tables,
-                 tuple(offsets), flat)  # fmt: skip
+    extents = [np.array([mi.traverse(shape)["extent"] for shape in shapes])] if family is Ellipsoids else []
+    return family(tuple(shapes), pointers, moves, uploaded(mi.UInt32, start), uploaded(mi.UInt32, count), *tables,
+                  tuple(offsets), flat, *(uploaded(mi.Float, a) for a in extents))  # fmt: skip

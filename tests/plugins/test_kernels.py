@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.scene import io as scene_io
 
 WARM_UP, CALLS = 4, 12
@@ -18,7 +18,26 @@ WARM_UP, CALLS = 4, 12
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test_later_calls_compile_nothing(llvm, mode, form):
     scene = scene_io.load_scene(scene_io.shipped_scene("baffled_light.xml"), res=16)
-    motion = perturb(scene, "blocker.vertex_positions", (1, 0, 0))
+    check(scene, mode, form, perturb(scene, "blocker.vertex_positions", (1, 0, 0)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "param"),
+    [
+        ("rod_shadow", "blocker.control_points"),
+        ("grid_shadow", "blocker.grid"),
+        ("grid_shadow", "camera.to_world"),
+        ("ellipsoids_shadow", "camera.to_world"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_curves_and_grids_compile_nothing_later(llvm, mode, name, param):
+    scene = scene_io.load_scene(scene_io.shipped_scene(f"{name}.xml"), res=16)
+    check(scene, mode, "spatial", perturb(scene, param, None if param.endswith("grid") else (1, 0, 0)))
+
+
+def check(scene: mi.Scene, mode: str, form: str, motion: Perturbation) -> None:
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": form, "sppc": 4})
     compiled, known = [], set()  # by hash: kernels that an earlier process has left on disk count as compiled here
     for seed in range(CALLS):

@@ -13,9 +13,12 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_ellipsoid import EllipsoidOutlines
+from psdr_jit.edges.kind_grid import GridEdges
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
 from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
+from psdr_jit.edges.kind_rod import RodEdges
 from psdr_jit.edges.kind_shading import ShadingOutlines
 from psdr_jit.edges.kind_tube import TubeOutlines
 from psdr_jit.edges.scene_table import scene_edges
@@ -24,7 +27,8 @@ from psdr_jit.scene.params import also_enabled
 
 COUNT = 4096
 SHIFT = (0.48, 0.6, 0.64)
-PLACED = ("vertex_positions", "to_world", "control_points")
+PLACED = ("vertex_positions", "to_world", "control_points", "data")
+STRIDES = {"control_points": 4, "data": 10}
 PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
@@ -33,6 +37,9 @@ PLACES = {  # kind: a scene that has it, and what moves there
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
     TubeOutlines: ("curve_shadow", ["blocker.control_points"]),
+    RodEdges: ("rod_shadow", ["blocker.control_points"]),
+    EllipsoidOutlines: ("ellipsoids_shadow", ["blocker.data"]),
+    GridEdges: ("grid_shadow", ["blocker.to_world"]),
 }
 
 
@@ -126,7 +133,7 @@ def test_everything_shifted_shifts_the_edge(found):
     dr.enable_grad(θ)
     still = ("camera", "light", "lamp")
     for name in [k for k in params.keys() if k.endswith(PLACED) and not k.startswith(still)]:
-        params[name] = moved(params[name], θ, 4 if name.endswith("control_points") else 3)
+        params[name] = moved(params[name], θ, STRIDES.get(name.split(".")[-1], 3))
     params.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)
     motion = kind.displacement(row, sight.at, sight.ω, mi.Bool(True))
@@ -141,8 +148,9 @@ def test_everything_shifted_shifts_the_edge(found):
 def moved(value, θ, stride):
     if "Transform" in type(value).__name__:
         return mi.Transform4f().translate(mi.Vector3f(SHIFT) * θ) @ dr.detach(value)
-    point = dr.unravel(mi.Point3f if stride == 3 else mi.Point4f, dr.detach(value))  # a curve's with its radius
-    return dr.ravel(point + type(point)(*SHIFT, *[0] * (stride - 3)) * θ)
+    # a curve's points with their radius, an ellipsoid's centre with its shape
+    count = dr.width(value) // stride
+    return dr.detach(value) + dr.tile(mi.Float(*[[*SHIFT, *[0.0] * (stride - 3)]]), count) * θ
 
 
 def test_rays_pass_beside(found):

@@ -1,0 +1,98 @@
+"""The surface of a grid of signed distances whose values move, attached (`scene.grids`).
+
+A ray of moving origin and direction meets the surface f = 0 where it meets the tangent plane, which moves by −δf / |∇f|
+along the normal with the values, and with the place of the grid. The normal is that of the cell there. For shading it
+may be blended, as Mitsuba does [Hansson-Söderlund et al. 2022]: between the normals of the eight cells about the
+nearest grid point, the slopes of each taken across it at the coordinates of the point.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.sdf_cell import Cell
+from ..scene.grids import TO_WORLD, VALUES, MovingGrid
+
+
+def grid_surface(
+    grid: MovingGrid, pi: mi.PreliminaryIntersection3f, segment: mi.UInt32, ray: mi.Ray3f, follow: bool, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """The surface of `grid`; lanes that are not `active` hold anything finite. `follow`: the point moves with the
+    surface, not along the ray.
+    """
+    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
+    t = dr.select(active, pi.t, 0)
+    params = mi.traverse(grid.shape)
+    to_world, field = params[TO_WORLD], _Field(grid, mi.Float(params[VALUES].array), active)
+    cells = mi.Float(grid.cells)
+    x = mi.Point3f(dr.detach(o) + t * dr.detach(d))
+    p = mi.Point3f(x)
+    if dr.grad_enabled(o, d, to_world, field.values):
+        q = dr.detach(to_world.inverse() @ x)
+        cell, within = field.cell(q * cells)
+        g = mi.Vector3f(dr.detach(to_world @ mi.Normal3f(cell.gradient(within) * cells)))
+        slope = dr.norm(g)
+        n, f = g / slope, cell.value(within)
+        moved = to_world @ q - n * ((f - dr.detach(f)) / slope)
+        p = mi.Point3f(moved) if follow else o + d * dr.replace_grad(t, dr.dot(n, moved - o) / dr.dot(n, d))
+        p = mi.Point3f(dr.replace_grad(x, p))
+    q = (to_world.inverse() @ p) * cells
+    cell, within = field.cell(q)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = p
+    si.n = mi.Normal3f(dr.normalize(to_world @ mi.Normal3f(cell.gradient(within))))
+    n_s = dr.normalize(to_world @ mi.Normal3f(field.blended(q))) if grid.blends else si.n
+    si.sh_frame = mi.Frame3f(n_s)
+    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
+    si.time = ray.time
+    si.wi = si.sh_frame.to_local(-d)
+    si.prim_index = pi.prim_index
+    si.shape = pi.shape
+    return si
+
+
+class _Field:
+    """The values of a grid at points in units of cells, attached to both."""
+
+    def __init__(self, grid: MovingGrid, values: mi.Float, active: mi.Bool):
+        self.cells, self.values, self.active = grid.cells, values, active
+
+    def _corners(self, q: mi.Point3f) -> list[mi.UInt32]:
+        last = self.cells - 1
+        return [dr.minimum(mi.UInt32(dr.maximum(dr.detach(a), 0)), last) for a in (q.x, q.y, q.z)]
+
+    def cell(self, q: mi.Point3f) -> tuple[Cell, mi.Vector3f]:
+        """The cell around q, and q in its coordinates."""
+        corner, size = self._corners(q), self.cells + 1
+        first = corner[0] + size * (corner[1] + size * corner[2])
+        offsets = [first + i + size * j for j in (0, 1) for i in (0, 1)]
+        layers = [[dr.gather(mi.Float, self.values, a + size * size * k, self.active) for a in offsets] for k in (0, 1)]
+        within = mi.Vector3f(*(a - mi.Float(c) for a, c in zip((q.x, q.y, q.z), corner, strict=True)))
+        return Cell(*layers), within
+
+    def _value(self, q: mi.Point3f) -> mi.Float:
+        cell, within = self.cell(q)
+        return cell.value(within)
+
+    def blended(self, q: mi.Point3f) -> mi.Vector3f:
+        """Mitsuba's smooth normal, of any length. The grid ends before the cell below the first: it does not count."""
+        middle = [dr.round(dr.detach(a)) for a in (q.x, q.y, q.z)]
+        slopes, shares = [], []
+        for axis in range(3):
+            planes = []
+            for step in (-1, 0, 1):
+                at = mi.Point3f(q)
+                at[axis] = dr.clip(middle[axis] + step, 0, mi.Float(self.cells))
+                planes.append(self._value(at))
+            slopes.append([planes[1] - planes[0], planes[2] - planes[1]])
+            share = q[axis] - middle[axis] + 0.5
+            above = dr.select(middle[axis] < 1, 1, share)
+            shares.append([1 - above, above])
+        n = mi.Vector3f(0)
+        for k in range(8):
+            i = [k & 1, k >> 1 & 1, k >> 2 & 1]
+            weight = shares[0][i[0]] * shares[1][i[1]] * shares[2][i[2]]
+            slope = mi.Vector3f(*(slopes[axis][i[axis]] for axis in range(3)))
+            n += dr.select(dr.detach(weight) != 0, weight * dr.normalize(slope), 0)
+        return n

@@ -1,0 +1,61 @@
+"""The surface of linear curves, attached (`core.rod`): Mitsuba's own rests on the ray while both move.
+
+A ray of moving origin and direction meets the surface where it meets the tangent plane of the point at (v, n), which
+moves as c(v) + r(v) n does. All else, normal, frame and texture coordinates, follows from that point: v is linear in
+it. As Mitsuba has none, there are no derivatives by texture coordinates, and so no element of area.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.rod import Rod
+from ..scene.tubes import Rods
+
+
+def rod_surface(
+    rods: Rods,
+    pi: mi.PreliminaryIntersection3f,
+    segment: mi.UInt32,
+    ray: mi.Ray3f,
+    follow: bool,
+    active: mi.Bool,
+) -> mi.SurfaceInteraction3f:
+    """The surface of a linear curve; lanes that are not `active` hold anything finite. `follow`: the point moves with
+    the surface, not along the ray.
+    """
+    # lanes elsewhere must not divide by what is no rod
+    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
+    t = dr.select(active, pi.t, 0)
+    rod = rods.rod(segment, active)
+    x = dr.detach(o) + t * dr.detach(d)
+    v, n = (dr.detach(a) for a in rod.place(x))
+    on_surface = mi.Point3f(rod.centre(v) + rod.radius(v) * n)
+    if follow:  # whose ray may start a little beside that of the hit
+        x = dr.detach(on_surface)
+    p = mi.Point3f(x)
+    if dr.grad_enabled(o, d, rod):
+        p = on_surface if follow else o + d * dr.replace_grad(t, dr.dot(n, on_surface - o) / dr.dot(n, d))
+        p = dr.replace_grad(x, p)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    v, n = rod.place(p)
+    si.p, si.n, si.sh_frame = p, mi.Normal3f(n), mi.Frame3f(n)
+    count = dr.gather(mi.UInt32, rods.count, dr.reinterpret_array(mi.UInt32, pi.shape), active)
+    si.uv = mi.Point2f(_turns(rod, n), (v + pi.prim_index) / count)
+    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
+    si.time = ray.time
+    si.wi = si.sh_frame.to_local(-d)
+    si.prim_index = pi.prim_index
+    si.shape = pi.shape
+    return si
+
+
+def _turns(rod: Rod, n: mi.Vector3f) -> mi.Float:
+    """Texture coordinate u of Mitsuba: turns about the axis, from the direction nearest to the z axis."""
+    axis, _ = rod.axis
+    up = mi.Vector3f(0, 0, 1) - axis * axis.z
+    upright = dr.squared_norm(up) > 0
+    up = dr.select(upright, dr.normalize(dr.select(upright, up, mi.Vector3f(0, 1, 0))), mi.Vector3f(0, 1, 0))
+    u = dr.atan2(dr.dot(up, n), dr.dot(dr.cross(up, axis), n)) * dr.inv_two_pi
+    return dr.select(u < 0, u + 1, u)
