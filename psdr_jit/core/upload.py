@@ -33,3 +33,14 @@ def _numpy_type(kind: type) -> Any:
     if dr.is_float_v(kind):
         return np.float64 if dr.type_v(kind) == dr.VarType.Float64 else np.float32
     return np.uint32
+
+
+def in_memory(value):
+    """`value`, a parameter to be, evaluated and written.
+
+    Mitsuba 3.9.1 waits for kernels that read a parameter, then evaluates the new one and looks at its memory at once
+    (`sdfgrid`): it would find what was there before, and crash.
+    """
+    dr.eval(value)
+    dr.sync_thread()
+    return value

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.core.compat import CONTROL_POINTS
+from psdr_jit.core.upload import in_memory
 from psdr_jit.errors import ParameterError
 from psdr_jit.scene.guard import require_scene
 from psdr_jit.scene.names import traverse
@@ -74,7 +75,7 @@ class Perturbation:
         self.params.update()
 
     def _write(self, value: Any) -> None:
-        self.params[self.name] = value
+        self.params[self.name] = in_memory(value)
         # equal values are skipped by params, but an attached one must replace a detached one
         self.params.set_dirty(self.name)
         self.params.update()

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.core.film import require_samples
+from psdr_jit.core.upload import in_memory
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
@@ -74,7 +75,7 @@ class Problem:
     def apply(self, latents: Mapping[str, Mapping[str, Any]]) -> None:
         """Put the scene where the latents say; attached if they are."""
         for name, variable in self.variables.items():
-            self.params[name] = variable.value(latents[name])
+            self.params[name] = in_memory(variable.value(latents[name]))
             self.params.set_dirty(name)  # equal values are skipped, but an attached one must replace a detached one
         self.params.update()
 

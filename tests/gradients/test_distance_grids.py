@@ -10,6 +10,7 @@ from helpers import fd, forward
 
 from psdr_jit import make_plan
 from psdr_jit.core.memory import Memory
+from psdr_jit.core.upload import in_memory
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import gain
 from psdr_jit.edges.grid_triangles import grid_triangles
@@ -76,7 +77,7 @@ def test_its_surface_moves_with_its_values(llvm, normals):
         return mi.Ray3f(mi.Point3f(*EYE) + θ * mi.Vector3f(0.2, 0.1, 0.4), dr.normalize(d + θ * mi.Vector3f(0.1, 0, 0)))
 
     def move(θ):
-        params["blob.grid"] = mi.TensorXf(values.array + θ * direction, values.shape)
+        params["blob.grid"] = in_memory(mi.TensorXf(values.array + θ * direction, values.shape))
         params.update()
 
     h, met = 1e-3, []
