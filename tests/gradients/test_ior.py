@@ -165,6 +165,7 @@ ON_A_WALL = {"sppc": 1, "sppp": 0, "sppd": 0, "sppi": 1, "spps": 0}  # and nothi
 EVEN = {"sppc": 16, "sppp": 16, "sppi": 16, "spps": 16}
 
 
+@pytest.mark.slow
 def test_a_picture_behind_a_ball(llvm):
     motion = perturb(behind_glass(with_ior("ball")), "glass.bsdf.eta")
     assert_gain(motion, spec(6, **BEHIND), (8, 512), (STEP, 16, 4096))
@@ -202,6 +203,7 @@ def lit_ball(bsdf: dict) -> mi.Scene:
     }, optimize=False)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_moves_behind_it_is_seen_as_behind_mitsubas_glass(llvm):
     """Same samples, same derivative."""
     images = []

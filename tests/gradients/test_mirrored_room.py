@@ -93,12 +93,13 @@ def images(case: str, lamp: str, texture: dict | None, depth: int, spp: int) -> 
     return shown, moved_images(copy, in_copy, {**spec, "max_depth": depth}, spp)
 
 
-@pytest.mark.parametrize("case", ["sheet", *(pytest.param(c, marks=slow) for c in ("mirror", "camera", "lamp"))])
+@slow
+@pytest.mark.parametrize("case", ["sheet", "mirror", "camera", "lamp"])
 def test_a_shadow_in_a_mirror(llvm, case):
     assert_grad_close(*images(case, "point", None, 2, 64))
 
 
-@pytest.mark.parametrize("case", ["floor", *(pytest.param(c, marks=slow) for c in ("mirror", "camera"))])
+@pytest.mark.parametrize("case", ["mirror", *(pytest.param(c, marks=slow) for c in ("floor", "camera"))])
 @pytest.mark.parametrize("texture", [checkerboard, pytest.param(texels, marks=slow)])
 def test_a_pattern_in_a_mirror(llvm, case, texture):
     assert_grad_close(*images(case, "point", texture(), 2, 64))

@@ -133,9 +133,8 @@ def mirrored(case: str, width: float, spp: int, **more) -> tuple[np.ndarray, np.
     return estimate, moved_images(copy, in_copy, {**spec, "max_depth": 1}, spp)
 
 
-@pytest.mark.parametrize(
-    "case", [c if c == "mirror-turned" else pytest.param(c, marks=pytest.mark.slow) for c in MIRROR_CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", MIRROR_CASES)
 def test_a_mirror_shows_a_mirrored_copy(llvm, case):
     assert_grad_close(*mirrored(case, WIDTH, 64))
 
