@@ -88,7 +88,7 @@ PROBLEMS = (
     Problem("camera_perspective", "camera.principal_point_offset_x", 0.0005, slow=True),
     Problem("camera_orthographic", "camera.to_world", 0.005, direction=X, slow=True),
     Problem("camera_orthographic", "camera.to_world", 0.0005, rotate=Y, slow=True),
-    Problem("camera_thinlens", "camera.to_world", 0.004, direction=X),
+    Problem("camera_thinlens", "camera.to_world", 0.004, direction=X, slow=True),
     Problem("camera_thinlens", "camera.focus_distance", 0.05, slow=True),
     Problem("camera_thinlens", "camera.aperture_radius", 0.01, slow=True),
     Problem("camera_crop", "camera.to_world", 0.001, rotate=Y, slow=True),

@@ -100,8 +100,8 @@ def _warn_about_smooth_values(job: Job, smooth: list[ShapeFacts]) -> None:
     for facts in smooth:
         if VALUES in facts.geometry:
             message = (f"shape '{facts.name}' (sdfgrid, normals='smooth') is differentiated by its values: what turns "
-                       "black a fraction of a cell beside its outlines moves otherwise than these, and 5 % of the "
-                       "derivative are lost with 10 values along an axis; use normals='analytic', or more values")  # fmt: skip
+                       "black a fraction of a cell beside its outlines moves otherwise than these, and the derivative "
+                       "is 5 % off with 10 values along an axis; use normals='analytic', or more values")  # fmt: skip
             warn_once(message, UnsupportedWarning, job.call.memory)
 
 

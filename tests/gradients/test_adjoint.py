@@ -51,7 +51,8 @@ def check(case: str, term: str | None, known: bool | None, **options) -> None:
         assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
 
 
-SLOW = ("orthographic", "thin-lens", "sunk-ball", "sunk-mesh")  # much as others, with kernels of their own to compile
+# much as others, with kernels of their own to compile
+SLOW = ("orthographic", "thin-lens", "sunk-ball", "sunk-mesh", "sky", "curve", "ellipsoids", "grid")
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

@@ -125,6 +125,7 @@ def test_a_light_that_the_centre_of_a_ball_does_not_face(llvm):
     assert_grad_close(estimate, reference, 0.03)
 
 
+@pytest.mark.slow
 def test_a_camera_that_leaves_a_room(llvm):
     """Seen from inside first, the same integrator must still know the box as closed from outside, and the reverse."""
     from psdr_jit.derivative import integrator_specs
@@ -194,6 +195,7 @@ def test_the_outline_of_a_sphere_has_no_fireflies(llvm):
     assert 0 < int(integrator.stats["grazing"]) < 1e-4 * 16 * 16 * 64 * 64
 
 
+@pytest.mark.slow
 def test_shadows_are_seen_through_a_hidden_light(llvm):
     """The lamp hangs between sensor and floor, on which a box casts its shadow; `hide_emitters` looks through it."""
     lit = scene(

@@ -35,6 +35,7 @@ def test_forms_agree_on_every_scene(llvm, problem):
     compare(problem, seeds=64, spp=128, max_stderr=0.03)
 
 
+@pytest.mark.slow
 def test_material_form_against_finite_differences(llvm):
     """A light behind a baffle: all that moves on the floor has been scattered before."""
     problem = next(p for p in PROBLEMS if p.scene == "baffled_light")

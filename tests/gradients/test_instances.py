@@ -81,7 +81,7 @@ WAYS = {
     "own-material": ("material.brdf_0.reflectance.value", {}),
     "radiance": ("lamp.emitter.radiance.value", {}),
 }
-FAST = ("camera-turned", "own-material", "radiance")
+FAST = ("own-material", "radiance")
 
 
 @pytest.mark.parametrize("way", [way if way in FAST else pytest.param(way, marks=pytest.mark.slow) for way in WAYS])

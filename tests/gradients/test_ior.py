@@ -213,7 +213,8 @@ def test_what_moves_behind_it_is_seen_as_behind_mitsubas_glass(llvm):
     assert np.abs(images[0] - images[1]).max() < 1e-4 * np.abs(images[1]).max() > 0
 
 
-@pytest.mark.parametrize("seen", ["directly", pytest.param("by way of a wall", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seen", ["directly", "by way of a wall"])
 def test_backward_mode_is_the_adjoint(llvm, seen):
     scene = behind_glass(with_ior("ball")) if seen == "directly" else pane(GLASS, "sphere")
     forwards, backwards, w, jv = adjoint_identity(scene, "glass.bsdf.eta", integrator_specs.build(spec(6, **EVEN)))

@@ -74,6 +74,7 @@ def scene_of(points: np.ndarray, faces: np.ndarray) -> mi.Scene:
                          **parts}, optimize=False)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_bodies_of_one_mesh_that_cut_into_each_other(llvm):
     """The curve where they meet is an edge, though no face ends there."""
     motion = perturb(scene_of(*boxes(2)), *MOVED)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import adjoint_identity, assert_grad_close
 from test_patterns import checkerboard, texels
-from test_specular_chain import along, camera, moved_images, rest, turned
+from test_specular_chain import SEEDS, along, camera, moved_images, rest, turned
 
 from psdr_jit.derivative import integrator_specs
 
@@ -68,7 +68,9 @@ MOTIONS = {  # of floor, sheet, lamp (at a point), mirror and camera
 }
 
 
-def images(case: str, lamp: str, texture: dict | None, depth: int, spp: int) -> tuple[np.ndarray, np.ndarray]:
+def images(
+    case: str, lamp: str, texture: dict | None, depth: int, spp: int, seeds: int = SEEDS
+) -> tuple[np.ndarray, np.ndarray]:
     """Derivative images `(in the mirror, of the copy)` by seeds."""
     seen, copy = room(lamp, texture)
     motion, flip = MOTIONS[case], mi.Transform4f().scale([1, 1, -1])
@@ -89,8 +91,8 @@ def images(case: str, lamp: str, texture: dict | None, depth: int, spp: int) -> 
     for named in (in_mirror, in_copy):
         named["camera.to_world"] = lambda θ: motion.get("camera", rest)(θ) @ eye
     spec = {"type": "psdr_path", "rr_depth": 1000, "form": "spatial"}
-    shown = moved_images(seen, in_mirror, {**spec, "max_depth": depth + 1}, spp)
-    return shown, moved_images(copy, in_copy, {**spec, "max_depth": depth}, spp)
+    shown = moved_images(seen, in_mirror, {**spec, "max_depth": depth + 1}, spp, seeds)
+    return shown, moved_images(copy, in_copy, {**spec, "max_depth": depth}, spp, seeds)
 
 
 @slow
@@ -99,8 +101,13 @@ def test_a_shadow_in_a_mirror(llvm, case):
     assert_grad_close(*images(case, "point", None, 2, 64))
 
 
-@pytest.mark.parametrize("case", ["mirror", *(pytest.param(c, marks=slow) for c in ("floor", "camera"))])
-@pytest.mark.parametrize("texture", [checkerboard, pytest.param(texels, marks=slow)])
+def test_a_pattern_and_a_shadow_in_a_mirror_that_turns(llvm):
+    assert_grad_close(*images("mirror", "point", checkerboard(), 2, 32, 6), max_stderr=0.05)
+
+
+@slow
+@pytest.mark.parametrize("case", ["mirror", "floor", "camera"])
+@pytest.mark.parametrize("texture", [checkerboard, texels])
 def test_a_pattern_in_a_mirror(llvm, case, texture):
     assert_grad_close(*images(case, "point", texture(), 2, 64))
 

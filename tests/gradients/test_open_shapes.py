@@ -132,6 +132,7 @@ def test_a_tube_under_a_turning_camera(llvm):
     assert_agrees("cylinder", "area", 2, "camera.to_world", PAN, rotate=(0, 0.2, 1))
 
 
+@pytest.mark.slow
 def test_a_tube_that_moves(llvm):
     assert_agrees("cylinder", "area", 2, "shape", STEP, direction=(1, 0, 0.3))
 

@@ -214,11 +214,12 @@ def test_other_cameras(llvm, camera):
     assert_gain(scene, "thing.to_world", MOVED)
 
 
-@pytest.mark.parametrize("form", ["spatial", pytest.param("material", marks=slow)])
+@slow
+@pytest.mark.parametrize("form", ["spatial", "material"])
 @pytest.mark.parametrize("plugin, param", [
     ("rectangle", "thing.to_world"),
-    pytest.param("sphere", "thing.to_world", marks=slow),
-    pytest.param("cube", "thing.vertex_positions", marks=slow),
+    ("sphere", "thing.to_world"),
+    ("cube", "thing.vertex_positions"),
 ])  # fmt: skip
 def test_forward_and_backward_mode_are_transposes(llvm, plugin, param, form):
     scene = scene_of(painted(texels(), plugin, 0.6), wall=glossy_wall())

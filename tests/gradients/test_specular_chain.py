@@ -69,10 +69,12 @@ def behind_glass(glass: dict | mi.Mesh) -> mi.Scene:
     return mi.load_dict(scene, optimize=False)
 
 
-def moved_images(scene: mi.Scene, poses: dict[str, Callable], integrator: dict, spp: int) -> np.ndarray:
+def moved_images(
+    scene: mi.Scene, poses: dict[str, Callable], integrator: dict, spp: int, seeds: int = SEEDS
+) -> np.ndarray:
     """Derivative images (seeds, H, W, C) with the parameters `poses` set to functions of θ."""
     params, built, images = mi.traverse(scene), mi.load_dict(integrator), []
-    for seed in range(SEEDS):
+    for seed in range(seeds):
         θ = mi.Float(0)
         dr.enable_grad(θ)
         for name, pose in poses.items():
@@ -241,12 +243,13 @@ def assert_gain(motion: Perturbation, depth: int, step: float):
     assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [
     "mirror.to_world",
-    pytest.param("camera.to_world", marks=pytest.mark.slow),
-    pytest.param("card.to_world", marks=pytest.mark.slow),
-    pytest.param("glass.to_world", marks=pytest.mark.slow),
-    pytest.param("glass.vertex_positions", marks=pytest.mark.slow),
+    "camera.to_world",
+    "card.to_world",
+    "glass.to_world",
+    "glass.vertex_positions",
 ])  # fmt: skip
 def test_backward_mode_is_the_adjoint(llvm, name):
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, **ALONE})

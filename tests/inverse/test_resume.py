@@ -75,6 +75,7 @@ def test_killed_and_resumed(llvm, whole, tmp_path):
     same_as_whole(whole, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_interrupted_and_resumed(llvm, whole, tmp_path):
     config, _ = whole
     process = started(config, tmp_path / "out", reach=7)
