@@ -46,7 +46,7 @@ SMOOTH = {"normals": "smooth"}
 
 PROBLEMS = (
     # light that moves or changes
-    Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X),
+    Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X, slow=True),
     Problem("textured_emitter", "card.vertex_positions", 0.004, rotate=(0, 1, 1), slow=True),
     Problem("textured_emitter", "card.emitter.radiance.data", 0.01),
     Problem("textured_emitter", "card.vertex_texcoords", 0.003),
@@ -164,7 +164,7 @@ PROBLEMS = (
     Problem("rough_glass", "lamp.to_world", 0.004, direction=X, load=DEPTH_3, slow=True),
     # steps inside surfaces
     Problem("patterns", "floor.to_world", 0.004, direction=X, slow=True),
-    Problem("patterns", "ball.to_world", 0.004, rotate=(1, 1, 0)),
+    Problem("patterns", "ball.to_world", 0.004, rotate=(1, 1, 0), slow=True),
     Problem("patterns", "camera.to_world", 0.0005, rotate=Y, slow=True),
     # shapes that cut into each other
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=Y),

@@ -52,7 +52,9 @@ def check(case: str, term: str | None, known: bool | None, **options) -> None:
 
 
 # much as others, with kernels of their own to compile
-SLOW = ("orthographic", "thin-lens", "sunk-ball", "sunk-mesh", "sky", "curve", "ellipsoids", "grid")
+SLOW = (
+    "orthographic", "thin-lens", "sunk-ball", "sunk-mesh", "floor-around-ball", "sky", "curve", "ellipsoids", "grid"
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

@@ -158,6 +158,7 @@ def assert_alike(images: np.ndarray, others: np.ndarray, tolerance: float):
     assert slope.stderr < 0.02, slope
 
 
+@pytest.mark.slow
 def test_slivers_do_not_stop_the_rays_that_pass_them(llvm):
     """Rounding lets a ray hit a sliver of aspect ratio 1000 beside its edge; a ball of slivers is a ball."""
     coarse, fine = (stretched(stability.of_mesh(partial(meshes.ball, 3, n))) for n in (64, 4096))
@@ -171,6 +172,7 @@ def test_place_in_space_does_not_matter(llvm, shift, tolerance):
         assert_alike(stretched(stability.placed(1, shift)), stretched(stability.placed(1, 0)), tolerance)
 
 
+@pytest.mark.slow
 def test_fine_creases_are_sampled_by_what_they_show(llvm):
     """Flat faces of a ball are the less visible the more there are: few samples should go to each."""
     balls = [stability.of_mesh(partial(meshes.round_ball, n)) for n in (1e4, 1e5)]

@@ -108,9 +108,8 @@ def test_what_is_not_there_casts_no_shadow(llvm):
     assert_grad_close(-indirect, direct, max_stderr=0.03)
 
 
-@pytest.mark.parametrize(
-    "bsdf, plugin", [(DIELECTRIC, "sphere"), pytest.param(PLASTIC, "rectangle", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("bsdf, plugin", [(DIELECTRIC, "sphere"), (PLASTIC, "rectangle")])
 def test_forward_and_backward_agree(llvm, bsdf, plugin):
     integrator = integrator_specs.build(spec(4, sppc=16, sppp=16, sppd=16, sppi=64))
     wJv, JTwv, w, Jv = adjoint_identity(pane(bsdf, plugin), "glass.to_world", integrator)
