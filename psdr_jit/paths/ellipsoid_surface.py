@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.tubes import Ellipsoids
+from .own_surface import of_hit, on_ray, where_active
 
 
 def ellipsoid_surface(
@@ -23,8 +24,7 @@ def ellipsoid_surface(
     """The surface of an ellipsoid; lanes that are not `active` hold anything finite. `follow`: the point moves with
     the surface, not along the ray.
     """
-    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
-    t = dr.select(active, pi.t, 0)
+    o, d, t = where_active(ray, pi, active)
     body = bodies.ellipsoid(index, active)
     x = mi.Point3f(dr.detach(o) + t * dr.detach(d))
     m = dr.normalize(dr.detach(body.on_sphere(x - body.c)))
@@ -33,15 +33,10 @@ def ellipsoid_surface(
     p = x
     if dr.grad_enabled(o, d, body):
         moved, n = body.point(m), dr.detach(body.normal(m))
-        p = moved if follow else o + d * dr.replace_grad(t, dr.dot(n, moved - o) / dr.dot(n, d))
+        p = moved if follow else on_ray(o, d, t, n, moved)
         p = mi.Point3f(dr.replace_grad(x, p))
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p = p
     si.n = mi.Normal3f(body.normal(body.on_sphere(p - body.c)))
     si.sh_frame = mi.Frame3f(si.n)
-    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
-    si.time = ray.time
-    si.wi = si.sh_frame.to_local(-d)
-    si.prim_index = pi.prim_index
-    si.shape = pi.shape
-    return si
+    return of_hit(si, pi, ray, (o, d, t))

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from ..core.sdf_cell import Cell
 from ..scene.grids import TO_WORLD, VALUES, MovingGrid
+from .own_surface import of_hit, on_ray, where_active
 
 
 def grid_surface(
@@ -21,8 +22,7 @@ def grid_surface(
     """The surface of `grid`; lanes that are not `active` hold anything finite. `follow`: the point moves with the
     surface, not along the ray.
     """
-    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
-    t = dr.select(active, pi.t, 0)
+    o, d, t = where_active(ray, pi, active)
     params = mi.traverse(grid.shape)
     to_world, field = params[TO_WORLD], _Field(grid, mi.Float(params[VALUES].array), active)
     cells = mi.Float(grid.cells)
@@ -35,7 +35,7 @@ def grid_surface(
         slope = dr.norm(g)
         n, f = g / slope, cell.value(within)
         moved = to_world @ q - n * ((f - dr.detach(f)) / slope)
-        p = mi.Point3f(moved) if follow else o + d * dr.replace_grad(t, dr.dot(n, moved - o) / dr.dot(n, d))
+        p = mi.Point3f(moved) if follow else on_ray(o, d, t, n, moved)
         p = mi.Point3f(dr.replace_grad(x, p))
     q = (to_world.inverse() @ p) * cells
     cell, within = field.cell(q)
@@ -44,12 +44,7 @@ def grid_surface(
     si.n = mi.Normal3f(dr.normalize(to_world @ mi.Normal3f(cell.gradient(within))))
     n_s = dr.normalize(to_world @ mi.Normal3f(field.blended(q))) if grid.blends else si.n
     si.sh_frame = mi.Frame3f(n_s)
-    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
-    si.time = ray.time
-    si.wi = si.sh_frame.to_local(-d)
-    si.prim_index = pi.prim_index
-    si.shape = pi.shape
-    return si
+    return of_hit(si, pi, ray, (o, d, t))
 
 
 class _Field:

@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from ..core.rod import Rod
 from ..scene.tubes import Rods
+from .own_surface import of_hit, on_ray, where_active
 
 
 def rod_surface(
@@ -25,9 +26,7 @@ def rod_surface(
     """The surface of a linear curve; lanes that are not `active` hold anything finite. `follow`: the point moves with
     the surface, not along the ray.
     """
-    # lanes elsewhere must not divide by what is no rod
-    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
-    t = dr.select(active, pi.t, 0)
+    o, d, t = where_active(ray, pi, active)
     rod = rods.rod(segment, active)
     x = dr.detach(o) + t * dr.detach(d)
     v, n = (dr.detach(a) for a in rod.place(x))
@@ -36,19 +35,14 @@ def rod_surface(
         x = dr.detach(on_surface)
     p = mi.Point3f(x)
     if dr.grad_enabled(o, d, rod):
-        p = on_surface if follow else o + d * dr.replace_grad(t, dr.dot(n, on_surface - o) / dr.dot(n, d))
+        p = on_surface if follow else on_ray(o, d, t, n, on_surface)
         p = dr.replace_grad(x, p)
     si = dr.zeros(mi.SurfaceInteraction3f)
     v, n = rod.place(p)
     si.p, si.n, si.sh_frame = p, mi.Normal3f(n), mi.Frame3f(n)
     count = dr.gather(mi.UInt32, rods.count, dr.reinterpret_array(mi.UInt32, pi.shape), active)
     si.uv = mi.Point2f(_turns(rod, n), (v + pi.prim_index) / count)
-    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
-    si.time = ray.time
-    si.wi = si.sh_frame.to_local(-d)
-    si.prim_index = pi.prim_index
-    si.shape = pi.shape
-    return si
+    return of_hit(si, pi, ray, (o, d, t))
 
 
 def _turns(rod: Rod, n: mi.Vector3f) -> mi.Float:

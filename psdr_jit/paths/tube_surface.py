@@ -20,6 +20,7 @@ from ..core.tube_axis import Axis
 from ..scene.tubes import Splines, Tubes
 from .ellipsoid_surface import ellipsoid_surface
 from .grid_surface import grid_surface
+from .own_surface import of_hit, on_ray, where_active
 from .rod_surface import rod_surface
 
 
@@ -58,16 +59,16 @@ def _spline_surface(
     active: mi.Bool,
 ) -> mi.SurfaceInteraction3f:
     """The surface of a curve; lanes that are not `active` hold anything finite."""
-    # lanes elsewhere must not divide by what is no tube
-    o, d = (dr.select(active, a, b) for a, b in ((ray.o, mi.Point3f(0)), (ray.d, mi.Vector3f(0, 0, 1))))
-    t, v = dr.select(active, pi.t, 0), mi.Float(pi.prim_uv.x)
+    o, d, t = where_active(ray, pi, active)
+    v = mi.Float(pi.prim_uv.x)
     axis = tubes.axis(segment, v, active)
     x = dr.detach(o) + t * dr.detach(d)
     if follow:  # whose ray may start a little beside that of the hit
         x = mi.Point3f(dr.detach(_material(axis, x)))
     p = mi.Point3f(x)
     if dr.grad_enabled(o, d, axis):
-        p = mi.Point3f(_material(axis, x) if follow else _on_ray(axis, x, o, d, t))
+        moved, n = _material(axis, x), dr.detach(axis.normal(x - axis.c))
+        p = mi.Point3f(moved if follow else on_ray(o, d, t, n, moved))
         p = dr.replace_grad(x, p)
         v = dr.replace_grad(v, dr.dot(p - axis.c, axis.dc) / dr.detach(axis.bend(x - axis.c)))
         axis = tubes.axis(segment, v, active)
@@ -75,24 +76,13 @@ def _spline_surface(
     shape = dr.reinterpret_array(mi.UInt32, pi.shape)
     si.uv.y = (v + pi.prim_index) / dr.gather(mi.UInt32, tubes.count, shape, active)
     si.dp_dv *= dr.gather(mi.UInt32, tubes.count, shape, active)
-    si.t = dr.replace_grad(t, dr.dot(p - o, dr.detach(d)))
-    si.time = ray.time
-    si.wi = si.sh_frame.to_local(-d)
-    si.prim_index = pi.prim_index
-    si.shape = pi.shape
-    return si
+    return of_hit(si, pi, ray, (o, d, t))
 
 
 def _material(axis: Axis, x: mi.Point3f) -> mi.Vector3f:
     """Where the material point goes that is at `x` (detached)."""
     a, _, _ = axis.circle(dr.detach(x - axis.c))
     return axis.c + axis.r * a
-
-
-def _on_ray(axis: Axis, x: mi.Point3f, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
-    """Where the attached ray from `o` along `d`, at whose distance `t` the point `x` lies, meets the surface."""
-    n = dr.detach(axis.normal(x - axis.c))
-    return o + d * dr.replace_grad(t, dr.dot(n, _material(axis, x) - o) / dr.dot(n, d))
 
 
 def _geometry(axis: Axis, p: mi.Point3f) -> mi.SurfaceInteraction3f:
