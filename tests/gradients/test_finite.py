@@ -12,7 +12,7 @@ from problems import PROBLEMS, Problem
 from psdr_jit.derivative import integrator_specs
 
 SIZE, SPP = 16, 4
-QUICK = ("area_shadow", "sunk_ball", "rough_dielectric")
+QUICK = ("area_shadow", "sunk_ball")
 
 
 def check(problem: Problem, seeds: int) -> None:

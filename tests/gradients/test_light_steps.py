@@ -155,11 +155,12 @@ def test_two_lights(llvm):
     assert_gain(scene_of(projector(picture()), other=other), "floor.to_world", {"direction": (0.4, 0.3, 1)})
 
 
-@pytest.mark.parametrize("form", ["spatial", pytest.param("material", marks=slow)])
+@slow
+@pytest.mark.parametrize("form", ["spatial", "material"])
 @pytest.mark.parametrize("light, param", [
     (lambda: projector(picture()), "light.to_world"),
-    pytest.param(spot, "floor.to_world", marks=slow),
-    pytest.param(spot, "light.cutoff_angle", marks=slow),
+    (spot, "floor.to_world"),
+    (spot, "light.cutoff_angle"),
 ])  # fmt: skip
 def test_forward_and_backward_mode_are_transposes(llvm, light, param, form):
     scene = scene_of(light(), wall=wall(), card=card())

@@ -99,9 +99,8 @@ def test_a_glowing_sphere(llvm, segments, param, how):
     assert_gain(sphere(segments, **LIGHT), param, **how)
 
 
-@pytest.mark.parametrize(
-    "segments", [pytest.param(24, marks=pytest.mark.slow), 64, pytest.param(200, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("segments", [24, 64, 200])
 @pytest.mark.parametrize("param, how", EVERY_WAY)
 def test_a_diffuse_sphere(llvm, segments, param, how):
     assert_gain(sphere(segments, **REFLECTOR), param, **how)

@@ -117,7 +117,7 @@ PRUNED = {  # scenes of which the planner leaves out something, and what moves
 }
 
 
-SLOW = ("hidden", "convex", "lamp", "box", "material")  # many kernels: every term with and without a plan
+SLOW = ("hidden", "convex", "lamp", "box", "material", "radiance")  # many kernels: every term with and without a plan
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in PRUNED])
