@@ -142,9 +142,10 @@ def _light_step(job: Job, pair: Pair, chain: ChainRecords, wavelengths) -> tuple
     ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
     si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
     source = dr.select(pair.seen, pair.a, pair.b)
-    value = pair.light.scattered(si, source, pair.in_light) * dr.select(pair.seen, 1, -1) * pair.β_a
+    towards = pair.light.towards(si, pair.in_light)
+    value = pair.light.scattered(si, towards, source, pair.in_light) * dr.select(pair.seen, 1, -1) * pair.β_a
     infinite = mi.has_flag(pair.light.pointer().flags(), mi.EmitterFlags.Infinite)
-    distance = dr.select(infinite, dr.inf, pair.light.towards(si, pair.in_light)[0].dist)
+    distance = dr.select(infinite, dr.inf, towards[0].dist)
     return job.call.counters.rejected.keep_finite(dr.select(pair.in_light, value, 0)), source, distance
 
 
@@ -156,7 +157,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
         return None
     chain = ChainRecords(dr.width(found.k), lines.world.depth)
     pair = lines.compare(found.at, chain)
-    dr.eval(pair, chain.hits)
+    dr.eval(pair, chain.hits, chain.bends)
     curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
     dr.eval(curve)
     line = lines.line(found.at.sample)

@@ -92,10 +92,9 @@ class LightPoint:
         """Where the shadow ray from `si` ends, and whether that is at this point."""
         return shadow_hit(scene, si, self.towards(si, active)[0], active)
 
-    def scattered(self, si: mi.SurfaceInteraction3f, source: Hit, active: mi.Bool) -> mi.Spectrum:
-        """What `si` scatters of it, over its density. `source`: the end of an unblocked shadow ray."""
-        emitter = self.pointer()
-        ds, value = self.towards(si, active)
+    def scattered(self, si: mi.SurfaceInteraction3f, seen: tuple, source: Hit, active: mi.Bool) -> mi.Spectrum:
+        """What `si` scatters of it, over its density. `seen`: of `towards`; `source`: the end of an unblocked ray."""
+        emitter, (ds, value) = self.pointer(), seen
         ray = mi.Ray3f(source.o, source.d, 0, si.wavelengths)
         light = source.intersection().compute_surface_interaction(ray, mi.RayFlags.All, active)
         on_surface = active & mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)

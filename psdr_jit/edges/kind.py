@@ -103,6 +103,20 @@ class Side:
         none = dr.zeros(mi.PreliminaryIntersection3f)
         return Side(ray, none, mi.Bool(True), mi.Bool(own), mi.Bool(True))
 
+    @staticmethod
+    def of_segment(segments, segment: mi.UInt32, x: mi.Point3f, sight: Sight, which: mi.UInt32, own: mi.Bool) -> Side:
+        """The point `x` of a `segment` of curves or bodies (`scene.tubes`) where `own`; elsewhere found by tracing.
+
+        It is not shot at: what it looks like beside its edge is known better than a ray meets it.
+        """
+        pi = dr.zeros(mi.PreliminaryIntersection3f)
+        pi.valid = own
+        pi.t = dr.select(own, sight.r, dr.inf)
+        pi.shape, pi.prim_index = segments.pointer(segment, own), segments.prim_index(segment, own)
+        beside = sight.beside(which)
+        ray = mi.Ray3f(dr.select(own, x - sight.r * sight.ω, beside.o), beside.d)
+        return Side(ray, pi, ~own, mi.Bool(own), mi.Bool(True))
+
 
 @dataclass
 class Line:

@@ -79,22 +79,11 @@ class EllipsoidOutlines(ContourKind):
         return sight.at.x + sight.offset * sight.n_perp
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
-        """The ellipsoid itself on the side −n_perp, and whatever a ray meets on the other.
-
-        It is never shot at: what it looks like a little inside of the edge is known better than Mitsuba meets it.
-        """
-        own = which == 0
+        """The ellipsoid itself on the side −n_perp, and whatever a ray meets on the other."""
         body, index = self._body(row, active), row // PIECES
         ω = dr.normalize(body.on_sphere(sight.ω))
         x = body.point(dr.normalize(mi.Vector3f(sight.at.local) - TURN * ω))
-        pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.valid = own & active
-        pi.t = dr.select(pi.valid, sight.r, dr.inf)
-        pi.shape = self.bodies.pointer(index, pi.valid)
-        pi.prim_index = self.bodies.prim_index(index, pi.valid)
-        beside = sight.beside(which)
-        ray = mi.Ray3f(dr.select(own, mi.Point3f(x - sight.r * sight.ω), beside.o), beside.d)
-        return Side(ray, pi, ~own, own, mi.Bool(True))
+        return Side.of_segment(self.bodies, index, mi.Point3f(x), sight, which, (which == 0) & active)
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of a material point, which keeps its place on the unit sphere."""

@@ -118,7 +118,7 @@ class RodEdges(ContourKind):
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """The curve itself on the side −n_perp, and whatever a ray meets on the other; on both sides of a crease, it is
-        the curve. It is never shot at: what it looks like there is known better than a ray meets it.
+        the curve.
         """
         rows = dr.gather(RodRows, self.rows, row, active)
         is_crease = rows.part == CREASE
@@ -129,14 +129,7 @@ class RodEdges(ContourKind):
         x = mi.Point3f(rod.centre(v) + rod.radius(v) * n)
         x_crease, segment = self._beside_crease(rows, rod, sight, which, active & is_crease)
         x, segment = dr.select(is_crease, x_crease, x), dr.select(is_crease, segment, rows.segment)
-        pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.valid = known & active
-        pi.t = dr.select(pi.valid, sight.r, dr.inf)
-        pi.shape = self.rods.pointer(segment, pi.valid)
-        pi.prim_index = self.rods.prim_index(segment, pi.valid)
-        beside = sight.beside(which)
-        ray = mi.Ray3f(dr.select(known, x - sight.r * sight.ω, beside.o), beside.d)
-        return Side(ray, pi, ~known, known, mi.Bool(True))
+        return Side.of_segment(self.rods, segment, mi.Point3f(x), sight, which, known & active)
 
     def _beside_crease(
         self, rows: RodRows, rod: Rod, sight: Sight, which: mi.UInt32, active: mi.Bool

@@ -147,15 +147,10 @@ class TubeOutlines(ContourKind):
         towards = dr.select(dr.dot(axis.turned_normal(a, b), sight.ω) < 0, TURN, -TURN)
         sin, cos = dr.sincos(dr.select(is_rim, 0, towards))
         x = axis.c + axis.r * (cos * a + sin * b)
-        pi = dr.zeros(mi.PreliminaryIntersection3f)
-        pi.valid = own & active
-        pi.t = dr.select(pi.valid, sight.r, dr.inf)
-        pi.shape = self.tubes.pointer(rows.segment, pi.valid)
-        pi.prim_index = self.tubes.prim_index(rows.segment, pi.valid)
-        pi.prim_uv = mi.Point2f(v, 0)
-        beside = sight.beside(which)
-        ray = mi.Ray3f(dr.select(own, mi.Point3f(x - sight.r * sight.ω), beside.o), beside.d)
-        return Side(ray, pi, ~own, own, ~is_rim | (dr.dot(axis.normal(axis.r * a), sight.ω) < 0))
+        side = Side.of_segment(self.tubes, rows.segment, mi.Point3f(x), sight, which, own & active)
+        side.pi.prim_uv = mi.Point2f(v, 0)
+        side.differs = ~is_rim | (dr.dot(axis.normal(axis.r * a), sight.ω) < 0)
+        return side
 
     def shades(self, row: mi.UInt32, on: OnEdge, ω: mi.Vector3f, active: mi.Bool) -> mi.Bool:
         rows = dr.gather(TubeRows, self.rows, row, active)

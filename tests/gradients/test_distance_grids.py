@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import fd, forward
+from test_linear_curves import EYE, scene_of
 
 from psdr_jit import make_plan
 from psdr_jit.core.memory import Memory
@@ -20,7 +21,6 @@ from psdr_jit.scene.facts import analyse
 from psdr_jit.scene.grids import blends_normals, moving_grids
 
 ONE_TERM = {"type": "psdr_path", "form": "spatial", "sppc": 1, "max_depth": 2}
-EYE = (0.3, -6, 1)
 
 
 def axes(n: int) -> list[np.ndarray]:
@@ -48,15 +48,6 @@ def grid(values: np.ndarray, normals: str = "analytic", size: float = 2.2, **chi
     place = mi.ScalarTransform4f().translate([-size / 2] * 3).scale(size)
     tensor = mi.TensorXf(values[..., None].astype(np.float32))
     return {"type": "sdfgrid", "grid": tensor, "normals": normals, "to_world": place, **children}
-
-
-def scene_of(**objects) -> mi.Scene:
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
-    pose = mi.ScalarTransform4f().look_at(origin=list(EYE), target=[0, 0, 0], up=[0, 0, 1])
-    camera = {"type": "perspective", "fov": 34, "to_world": pose, "film": film}
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.4]).scale(5)}
-    lamp = {"type": "point", "position": [1.5, -2.5, 4], "intensity": 50.0}
-    return mi.load_dict({"type": "scene", "camera": camera, "floor": floor, "lamp": lamp, **objects}, optimize=False)
 
 
 @pytest.mark.parametrize("normals", ["analytic", "smooth"])
