@@ -77,6 +77,19 @@ CASES = (
     Case("glossy reflection", "glossy_floor", BLOCKER, 3, X),
     Case("textured mover", "textured_emitter", "card.vertex_positions", 2, X),
     Case("patterned floor", "patterns", "floor.to_world", 2, X),
+    Case("patterned ball", "patterns", "ball.to_world", 2, rotate=(1, 1, 0)),
+    Case("smooth ball turned", "smooth_ball_shadow", BLOCKER, 3, rotate=(1, 1, 0)),
+    # mirrors, glass, plastic, windows and masks
+    Case("two mirrors", "mirrors", BLOCKER, 6, X),
+    Case("mirror turned", "mirrors", "mirror.to_world", 3, rotate=X),
+    Case("mirror floor", "shiny_floor", BLOCKER, 4, X, load={"floor": "conductor"}),
+    Case("plastic floor", "shiny_floor", BLOCKER, 3, X),
+    Case("glass ball", "glass", "body.to_world", 6, X),
+    Case("glass ball, IOR", "glass", "body.bsdf.eta", 6),
+    Case("glass cube", "glass", "body.vertex_positions", 6, rotate=Y, load={"body": "cube"}),
+    Case("window", "window", BLOCKER, 4, X),
+    Case("mask", "mask_shadow", "sheet.to_world", 3, X),
+    Case("reflected light", "reflected_light", "mirror.to_world", 3, rotate=X),
     Case("material only", "cbox", "white.reflectance.value", 4, load=CONTACT),
 )
 QUICK = ("area shadow", "point shadow", "cbox contact", "material only")

@@ -42,9 +42,10 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from .chain_fixed import Directions, LightPoint
+from .chain_lines import Lines
 from .chain_outline import AnalyticShapes, Curve, crossed_curve
 from .chain_patterns import INSET
-from .chain_search import Lines, find_crossings
+from .chain_search import find_crossings
 from .chain_sweeps import AtRest, carry_adjoints, carry_tangents
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
@@ -156,7 +157,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     if found is None:
         return None
     chain = ChainRecords(dr.width(found.k), lines.world.depth)
-    pair = lines.compare(found.at, chain)
+    pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
     dr.eval(pair, chain.hits, chain.bends)
     curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
     dr.eval(curve)
@@ -280,7 +281,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 
 def cost(form: str, sky: bool) -> float:
     """Time of a line relative to a path of the interior term (mirror, cube and ball of glass at 48², two cores)."""
-    return 4.0
+    return 6.0
 
 
 TERM = Term(

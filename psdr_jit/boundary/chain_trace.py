@@ -1,10 +1,10 @@
 """Two neighbouring camera rays and the paths that they follow: where do they first part?
 
 A path leaves its first vertex by a delta lobe, and every other one by a delta lobe or in the direction that its line
-keeps for it (`chain_fixed`). Which lobe is a matter of random numbers alone, the same for both paths and with the same
-probability wherever they are on a surface: nothing steps because of the choice, and a path's throughput is the product
-of the lobes' values over these probabilities. Total reflection leaves the transmitted lobe without a direction; its
-value has gone to 0 before, so that a path may end there without a step.
+keeps for it (`chain_fixed`). Which lobe is a matter of random numbers, and of shares that the line keeps as well: the
+same for both paths wherever they are on a surface, so that nothing steps because of the choice. A path's throughput is
+the product of the lobes' values over these probabilities. Total reflection leaves the transmitted lobe without a
+direction; its value has gone to 0 before, so that a path may end there without a step.
 
 Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
 shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
@@ -22,18 +22,12 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
-from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
-from .chain_fixed import Direction, Directions, LightPoint, draw_direction, draw_light
+from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
+from .chain_lobes import has_delta, leave, reflected_share, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
 CHAIN_DEPTH = 8
-
-#: Share of the chains that are reflected where a surface reflects and lets through.
-REFLECTED_SHARE = 1 / 3
-
-#: Share of the chains that go on by a smooth lobe where a surface has both kinds.
-SMOOTH_SHARE = 0.5
 
 #: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
 COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
@@ -107,59 +101,6 @@ class ChainRecords:
         return dr.gather(mi.Bool, self.bends, k * self.stride + self.lane, active)
 
 
-@dataclass
-class Leaving:
-    """How a chain goes on."""
-
-    ray: mi.Ray3f
-    factor: mi.Spectrum  # value of the lobe over the probability of its choice
-    alive: mi.Bool
-    by_delta: mi.Bool
-
-
-def has_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
-    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-
-
-def smooth_choice(bsdf: mi.BSDFPtr, k: mi.UInt32, u: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Is vertex `k` left by a smooth lobe, and with which probability was that chosen? The first one never is."""
-    flags = bsdf.flags()
-    smooth, delta = mi.has_flag(flags, mi.BSDFFlags.Smooth) & (k > 0), has_delta(bsdf)
-    chosen = smooth & (~delta | (u < SMOOTH_SHARE))
-    share = dr.select(chosen, mi.Float(SMOOTH_SHARE), 1 - SMOOTH_SHARE)
-    return chosen, dr.select(smooth & delta, share, 1)
-
-
-def leave(si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool) -> Leaving:
-    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses."""
-    bsdf = si.bsdf()
-    smooth, share = smooth_choice(bsdf, k, u.x)
-    smooth &= active
-    onward = _delta_leave(si, bsdf, u.y, active & ~smooth)
-    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(fixed.ω), smooth)
-    ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
-    factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
-    return Leaving(ray, factor, (smooth & dr.any(factor != 0)) | onward.alive, onward.alive)
-
-
-def _delta_leave(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, u: mi.Float, active: mi.Bool) -> Leaving:
-    """By the reflected lobe or the one that leads through, as `u` chooses."""
-    flags = bsdf.flags()
-    reflects = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
-    passes = mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission) | mi.has_flag(flags, mi.BSDFFlags.Null)
-    through = passes & (~reflects | (u >= REFLECTED_SHARE))
-    choice = dr.select(through, mi.Float(1 - REFLECTED_SHARE), REFLECTED_SHARE)
-    choice = dr.select(reflects & passes, choice, 1)
-    active = active & (reflects | passes)
-    number = dr.select(through, mi.Float(LAST_LOBE), FIRST_LOBE)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, number, mi.Point2f(0.5), active)
-    crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) < 0
-    alive = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0) & (crosses == through)
-    null = alive & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-    value = dr.select(null, bsdf.eval_null_transmission(si, null), weight * bs.pdf)
-    return Leaving(si.spawn_ray(si.to_world(bs.wo)), dr.select(alive, value / choice, 0), alive, alive)
-
-
 def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
     """Do two rays of directions d end on one continuous surface, or both escape? `a`, `b`: surface interactions."""
     both = a.is_valid() & b.is_valid()
@@ -192,19 +133,24 @@ class Numbers:
 
 
 @dr.syntax
-def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: Directions):
-    """Follow one chain of every line and draw its directions; `rng` as for `trace_pair`. Fills `out`."""
-    ray, k, active = mi.Ray3f(ray), mi.UInt32(0), mi.Bool(True)
+def guide(world: ChainWorld, rays: tuple[mi.Ray3f, mi.Ray3f], rng, sampler, line: mi.UInt32, out: Directions):
+    """Follow two chains of every line and draw what it keeps: directions by the first, shares of lobes by both.
+
+    `rng` as for `trace_pair`. Fills `out`.
+    """
+    ray_a, ray_b, k = mi.Ray3f(rays[0]), mi.Ray3f(rays[1]), mi.UInt32(0)
+    in_a, in_b = mi.Bool(True), mi.Bool(True)
     while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out]):
-        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        active &= si.is_valid()
+        a = world.scene.ray_intersect(ray_a, mi.RayFlags.All, False, in_a)
+        b = world.scene.ray_intersect(ray_b, mi.RayFlags.All, False, in_b)
+        in_a, in_b = in_a & a.is_valid(), in_b & b.is_valid()
         u = Numbers.draw(rng)
-        smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
-        fixed = draw_direction(si, sampler, smooth & active)
+        smooth, _ = smooth_choice(a.bsdf(), k, u.lobe.x)
+        fixed = draw_direction(a, sampler, smooth & in_a)
+        fixed.reflected = reflected_share((a, b), (in_a, in_b))
         out.write(k, line, fixed)
-        onward = leave(si, k, u.lobe, fixed, active)
-        ray, active = onward.ray, onward.alive
+        on_a, on_b = leave(a, k, u.lobe, fixed, in_a), leave(b, k, u.lobe, fixed, in_b)
+        ray_a, in_a, ray_b, in_b = on_a.ray, on_a.alive, on_b.ray, on_b.alive
         k += 1
 
 

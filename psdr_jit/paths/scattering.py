@@ -1,4 +1,4 @@
-"""How a path goes on at a surface: BSDF sampling, with a share of uniform directions where derivatives need it.
+"""How a path goes on at a surface: BSDF sampling, with a share of even choices where derivatives need it.
 
 A derivative divides by cosines that the value does not have: a surface that turns changes cosθ itself, and a vertex
 slides by 1/cosθ. Under a density that vanishes with cosθ, as that of a diffuse BSDF does, the variance of
@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+
+from .delta_step import FIRST_LOBE, LAST_LOBE
 
 #: Share of uniform directions where derivatives are estimated along a path.
 UNIFORM_SHARE = 0.25
@@ -55,6 +57,17 @@ def _share(bsdf: mi.BSDFPtr, share: float) -> mi.Float:
     return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta), 0, share)
 
 
+def _two_delta_lobes(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Does it reflect and let through, perfectly specularly?
+
+    One of the lobes ends where the surface is seen edge-on or reflects totally. Its value T goes to 0 there as √x does
+    with the distance x from that place, and its derivative as 1/√x: chosen with probability T, it would be Ṫ²/T.
+    """
+    flags = bsdf.flags()
+    through = mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission) | mi.has_flag(flags, mi.BSDFFlags.Null)
+    return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) & through
+
+
 def _refused(weight: mi.Spectrum, f: mi.Spectrum) -> mi.Bool:
     """Samples that a BSDF sent back with weight 0 though it is not 0 there.
 
@@ -76,13 +89,20 @@ def accepted(ctx, si, bsdf: mi.BSDFPtr, bs, weight: mi.Spectrum, refuses: bool, 
 def sample_scattering(
     ctx, si, bsdf: mi.BSDFPtr, u_lobe: mi.Float, u: mi.Point2f, share: float, refuses: bool, active: mi.Bool
 ) -> Scattering:
-    """Direction in which a path goes on: uniform with probability `share`, else sampled from the BSDF."""
+    """Direction in which a path goes on: uniform with probability `share`, else sampled from the BSDF.
+
+    Of two delta lobes, each is chosen with half of that probability, else as the BSDF does.
+    """
     if share == 0:
         bs, weight = bsdf.sample(ctx, si, u_lobe, u, active)
         return accepted(ctx, si, bsdf, bs, weight, refuses, active)
     q = _share(bsdf, share)
     uniform = u_lobe < q
-    u_lobe = dr.select(uniform, u_lobe / q, (u_lobe - q) / (1 - q))
+    two_lobes = _two_delta_lobes(bsdf)
+    evenly = two_lobes & (u_lobe < share)
+    skipped = dr.select(two_lobes, share, q)
+    u_lobe = dr.select(u_lobe < skipped, u_lobe / skipped, (u_lobe - skipped) / (1 - skipped))
+    u_lobe = dr.select(evenly, dr.select(u_lobe < 0.5, FIRST_LOBE, LAST_LOBE), u_lobe)
     bs, weight = bsdf.sample(ctx, si, u_lobe, u, active & ~uniform)
     delta = ~uniform & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
 
@@ -95,7 +115,10 @@ def sample_scattering(
     f, pdf_bsdf = bsdf.eval_pdf(ctx, si, wo, active & ~delta)
     pdf = mixture_pdf(si, bsdf, wo, pdf_bsdf, share)
     found = (uniform | ((bs.pdf > 0) & ~_refused(weight, f))) & (pdf > 0)
-    weight = dr.select(delta, weight, dr.select(found, f / pdf, 0))
+    # Where one of the lobes is not there, such as in total reflection, every choice leads to the other one.
+    chosen = dr.select(two_lobes & (bs.pdf < 1), share / 2 + (1 - share) * bs.pdf, bs.pdf)
+    of_delta = dr.select(chosen > 0, weight * (bs.pdf / chosen), 0)
+    weight = dr.select(delta, of_delta, dr.select(found, f / pdf, 0))
     η = dr.select(uniform, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette
-    pdf = dr.select(delta, bs.pdf, dr.select(found, pdf, 0))
+    pdf = dr.select(delta, chosen, dr.select(found, pdf, 0))
     return Scattering(wo, pdf, weight, η, delta)

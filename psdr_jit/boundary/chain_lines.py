@@ -1,0 +1,115 @@
+"""The lines on the film that are searched for steps of what is seen in mirrors and behind glass (`chain_search`).
+
+Every sample is a line across one pixel, horizontal or vertical. What its chains have in common, directions and shares
+of lobes, is drawn before they are traced (`chain_fixed`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.film import sampled_window
+from ..core.low_discrepancy import lane_sampler, pixel_sampler
+from ..core.streams import Stream, stream_seed
+from ..core.varying import varying
+from ..paths.rays import skip_emitters
+from ..plan.job import Job
+from ..plan.probe_motion import registry_table
+from .chain_fixed import Directions
+from .chain_patterns import ChainPatterns
+from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Pair, guide, trace_pair
+
+#: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
+LEAST_WIDTH, ROUNDING = 2.0**-14, 5e-7
+
+
+@dataclass
+class Line:
+    """The line of a sample on the film. Detached."""
+
+    start: mi.Point2f  # film position [px]
+    horizontal: mi.Bool
+    aperture: mi.Point2f
+    wavelength: mi.Float  # random number
+
+    def at(self, s: mi.Float) -> mi.Point2f:
+        """Film position [px] a share `s` of the way along."""
+        return self.start + dr.select(self.horizontal, mi.Point2f(s, 0), mi.Point2f(0, s))
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of a job, `job.spp` across each pixel, half of them horizontal on average. Host object."""
+
+    job: Job
+    world: ChainWorld
+    count: int
+    pixels: tuple[int, int]
+    corner: tuple[float, float]
+    directions: Directions  # of their smooth vertices
+
+    @staticmethod
+    def of(job: Job) -> Lines:
+        lower, upper = sampled_window(job.film)
+        width, height = (int(n) for n in upper - lower)
+        flat = {s.index for s in job.facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
+        depth = min(job.limits.max_depth, CHAIN_DEPTH)
+        world = ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job))
+        count = width * height * job.spp
+        directions = Directions(count, depth)
+        lines = Lines(job, world, count, (width, height), tuple(map(float, lower)), directions)
+        lines._guide()
+        dr.eval(directions.data)
+        return lines
+
+    def _guide(self) -> None:
+        """Draw the directions of all lines."""
+        sample = dr.arange(mi.UInt32, self.count)
+        sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
+        line, s = self.line(sample), sampler.next_1d()
+        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
+        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
+
+    def _numbers(self, sample: mi.UInt32):
+        """What chooses lobes and points of light, for all chains of a line."""
+        return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
+
+    def line(self, sample: mi.UInt32) -> Line:
+        rng = pixel_sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample, self.job.spp)
+        pixel, width = sample // varying(mi.UInt32, self.job.spp), varying(mi.UInt32, self.pixels[0])
+        row = pixel // width
+        corner = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + varying(mi.Point2f, self.corner)
+        horizontal, offset = rng.next_1d() < 0.5, rng.next_1d()
+        aperture, wavelength = rng.next_2d(), rng.next_1d()
+        start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
+        return Line(start, horizontal, aperture, wavelength)
+
+    @property
+    def per_pixel(self) -> mi.Float:
+        """Expected number of lines of one direction across a pixel."""
+        return varying(mi.Float, self.job.spp / 2)
+
+    def film(self, p: mi.Point2f) -> mi.Point2f:
+        """Film position p [px] in [0, 1]² of the crop window."""
+        frame = self.job.frame
+        return (p - varying(mi.Point2f, frame.crop_offset)) / varying(mi.Point2f, frame.crop_size)
+
+    def ray(self, line: Line, s: mi.Float) -> mi.Ray3f:
+        """The camera ray, behind the emitters that are hidden from the camera."""
+        ray, _ = self.job.sensor.sample_ray(0, line.wavelength, self.film(line.at(s)), line.aperture)
+        if not self.job.options.hide_emitters:
+            return mi.Ray3f(ray)
+        return skip_emitters(self.job.scene, ray, self.job.scene.ray_intersect_preliminary(ray))[0]
+
+    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float], store: ChainRecords | None = None) -> Pair:
+        """The chains from two places on the lines `sample`."""
+        line = self.line(sample)
+        rays = self.ray(line, ends[0]), self.ray(line, ends[1])
+        return trace_pair(self.world, rays, self._numbers(sample), (self.directions, sample), store)
+
+    @property
+    def least_width(self) -> mi.Float:
+        return varying(mi.Float, max(LEAST_WIDTH, ROUNDING * max(self.job.frame.crop_size)))
