@@ -76,8 +76,10 @@ def distance_to_knob(problem: Any, latents: Any) -> float:
 
 
 CAMERA, LAMP, BLOCKER = "camera.to_world", "lamp.position", "blocker.vertex_positions"
+BOX, BALL, IOR = "box.vertex_positions", "ball.to_world", "ball.bsdf.eta"
 CAMERA_SIZE = 4.3  # [units] from the camera to the middle of the boxes
 SHADOW_SIZE = 3.0  # [units] from the lamp to the floor
+MIRROR_SIZE = 3.0  # [units] from the mirror to the end of what it shows
 
 EXAMPLES = {
     "rotation": Example(
@@ -94,6 +96,16 @@ EXAMPLES = {
         "shadow",
         named(lamp=offset(LAMP, "distance", SHADOW_SIZE), blocker=offset(BLOCKER, "distance", SHADOW_SIZE)),
         {"lamp": below(0.01), "blocker": below(0.01)},
+    ),
+    "mirror": Example(
+        "mirror",
+        named(angle_degrees=offset(BOX, "angle_degrees"), distance=offset(BOX, "distance", MIRROR_SIZE)),
+        {"angle_degrees": below(0.5), "distance": below(0.005)},
+    ),
+    "glass": Example(
+        "glass",
+        named(ior=offset(IOR, "rms"), distance=offset(BALL, "distance")),
+        {"ior": below(0.01), "distance": below(0.01)},
     ),
 }
 

@@ -10,7 +10,8 @@ OURS, PEER = "psdr_path", "prb_projective"
 OVERHEAD = "overhead: "  # begins the names of cases that take the time of an iteration apart
 
 UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer": "Chamfer distance",
-         "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size"}  # fmt: skip
+         "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size",
+         "ior": "refractive index"}  # fmt: skip
 
 
 def outcome_table(found: list[dict[str, Any]]) -> str:

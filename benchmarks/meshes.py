@@ -1,4 +1,4 @@
-"""Meshes for sweeps: balls of any fineness or of slivers, boxes with subdivided faces. Flat-shaded, welded, closed."""
+"""Meshes for sweeps: balls of any fineness or of slivers, boxes with subdivided faces. Welded, closed."""
 
 from __future__ import annotations
 
@@ -61,10 +61,11 @@ def box(cells: int, bulge: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def replaced(scene: Any, name: str, points: np.ndarray, faces: np.ndarray) -> Any:
-    """The scene with the mesh `name` replaced by another shape of the same material."""
+    """The scene with the mesh `name` replaced by another shape of the same material, shaded as smoothly."""
     parts: dict[str, Any] = {"type": "scene", "sensor": scene.sensors()[0]}
     for shape in scene.shapes():
-        parts[shape.id()] = flat_mesh(name, points, faces, shape.bsdf()) if shape.id() == name else shape
+        make = smooth_mesh if shape.has_vertex_normals() else flat_mesh
+        parts[shape.id()] = make(name, points, faces, shape.bsdf()) if shape.id() == name else shape
     for k, emitter in enumerate(e for e in scene.emitters() if not mi.has_flag(e.flags(), mi.EmitterFlags.Surface)):
         parts[emitter.id() or f"emitter-{k}"] = emitter
     return mi.load_dict(parts, optimize=False)
@@ -72,10 +73,22 @@ def replaced(scene: Any, name: str, points: np.ndarray, faces: np.ndarray) -> An
 
 def flat_mesh(name: str, points: np.ndarray, faces: np.ndarray, bsdf: Any) -> Any:
     """A flat-shaded Mitsuba mesh."""
+    return _filled(mi.Mesh(name, len(points), len(faces), props=_props(bsdf, True)), points, faces)
+
+
+def smooth_mesh(name: str, points: np.ndarray, faces: np.ndarray, bsdf: Any) -> Any:
+    """A smooth-shaded Mitsuba mesh."""
+    mesh = mi.Mesh(name, len(points), len(faces), has_vertex_normals=True, props=_props(bsdf, False))
+    return _filled(mesh, points, faces)
+
+
+def _props(bsdf: Any, face_normals: bool) -> Any:
     props = mi.Properties()
-    props["bsdf"] = bsdf
-    props["face_normals"] = True
-    mesh = mi.Mesh(name, len(points), len(faces), props=props)
+    props["bsdf"], props["face_normals"] = bsdf, face_normals
+    return props
+
+
+def _filled(mesh: Any, points: np.ndarray, faces: np.ndarray) -> Any:
     params = mi.traverse(mesh)
     params["vertex_positions"] = points.ravel().astype(np.float32)
     params["faces"] = faces.ravel().astype(np.uint32)

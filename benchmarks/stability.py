@@ -73,6 +73,17 @@ def lit_from(degrees: float) -> Case:
     return Case("", "directional_shadow", "blocker.to_world", 2, X, load=load)
 
 
+def smooth(segments: float) -> Case:
+    """A smooth-shaded ball of so many segments around."""
+    ball = partial(meshes.ball, max(3, int(segments) // 2), int(segments))
+    return Case("", "smooth_ball_shadow", BLOCKER, 2, X, mesh=ball)
+
+
+def checkered(cells: float) -> Case:
+    """Squares of a checkerboard per side of the floor, two to a period."""
+    return Case("", "patterns", "floor.to_world", 2, X, load={"periods": cells / 2})
+
+
 SWEEPS = (
     Sweep("contact distance", "height of the box [units]", (0.1, 0.01, 1e-3, 1e-4, 0.0, -1e-3, -0.01),
           lambda lift: cornell(3, lift)),
@@ -88,6 +99,8 @@ SWEEPS = (
     Sweep("grazing light", "elevation of the light [degrees]", (60, 30, 15, 8, 4), lit_from),
     Sweep("scene size", "factor", (1.0, 1e3, 10.0, 0.1, 0.01, 1e-3), lambda size: placed(size, 0.0), placed(1.0, 0.0)),
     Sweep("scene offset", "units", (0.0, 10.0, 100.0, 1e3, 1e4), lambda shift: placed(1.0, shift), placed(1.0, 0.0)),
+    Sweep("smooth shading", "segments around a ball", (8, 16, 32, 64, 200, 1000), smooth),
+    Sweep("pattern", "squares per side of the floor", (2, 6, 20, 60, 100), checkered),
     Sweep("path length", "max_depth", (2, 3, 4, 6, 8, 12), lambda depth: cornell(int(depth), 0.06)),
 )  # fmt: skip
 QUICK, QUICK_STRIDE = ("contact distance", "scene offset"), 3
