@@ -103,3 +103,34 @@ def test_frames_of_triangles_in_one_plane_agree(variant):
     for own in (True, False):
         si = at(pi, ray, own)
         assert np.allclose(np.array(si.to_world(si.wi)).T, [0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["dielectric", "thindielectric"])
+@pytest.mark.parametrize("grazing", [False, True])
+def test_two_delta_lobes_share_even_choices(variant, kind, grazing):
+    """Each is chosen as often as is said; both are worth what they are; in total reflection there is one."""
+    from psdr_jit.paths.scattering import UNIFORM_SHARE, sample_scattering
+
+    si, ctx = interaction(below=grazing), mi.BSDFContext()
+    if grazing:  # from inside, beyond the critical angle of glass
+        si.wi = dr.normalize(mi.Vector3f(0.9, 0.2, -0.3))
+    rng = np.random.default_rng(0)
+    u_lobe, u = mi.Float(rng.random(COUNT)), mi.Point2f(rng.random(COUNT), rng.random(COUNT))
+    bsdf = mi.load_dict({"type": kind})
+    pointer = mi.BSDFPtr(bsdf)
+    s = sample_scattering(ctx, si, pointer, u_lobe, u, UNIFORM_SHARE, False, mi.Bool(True))
+    same_side = np.array(s.wo.z * si.wi.z) > 0
+    pdf, weight = np.array(s.pdf), np.array(s.weight)[0]
+    assert np.array(s.delta).all()
+    plain, worth = pointer.sample(ctx, si, mi.Float(0.0), mi.Point2f(0.5))
+    F = float(np.array(plain.pdf)[0])
+    for lobe, value in ((same_side, F * float(np.array(worth)[0][0])), (~same_side, None)):
+        if not lobe.any():
+            assert F == 1
+            continue
+        assert lobe.mean() == pytest.approx(pdf[lobe][0], abs=0.01)
+        assert pdf[lobe].min() >= UNIFORM_SHARE / 2
+        if value is not None:
+            np.testing.assert_allclose(weight[lobe] * pdf[lobe], value, rtol=1e-5)
+    expected = np.array(pointer.sample(ctx, si, u_lobe, u)[1])[0].mean()
+    assert weight.mean() == pytest.approx(expected, rel=0.02)
