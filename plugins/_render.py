@@ -16,7 +16,7 @@ from psdr_jit.errors import ParameterError
 from psdr_jit.options import Options
 from psdr_jit.plan.call import Call
 from psdr_jit.plan.plan import Plan
-from psdr_jit.scene.batch_sensor import parts_of, share, side_by_side, splits
+from psdr_jit.scene.batch_sensor import is_uniform, parts_of, share, side_by_side, splits
 from psdr_jit.scene.guard import require_integrator
 from psdr_jit.scene.io import find_sensor
 
@@ -46,45 +46,53 @@ class TermIntegrator(ADIntegrator):
         require_integrator(self)
         view = find_sensor(scene, sensor)
         films.require_samples(view, spp)
-        if not splits(view):
+        if not (splits(view) and is_uniform(view)):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
         return side_by_side([self._path.render(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
 
-    def call(self, scene, sensor, seed, spp, mode="forward") -> Call:
-        """A render call of this integrator as data."""
+    def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
+        """A render call of this integrator as data; `film`: in place of the sensor's own."""
         sensor = find_sensor(scene, sensor)
-        return Call(self, scene, sensor, self.options, self.memory, self.counters, seed, spp, mode)
+        film = film or sensor.film()
+        return Call(self, scene, sensor, film, self.options, self.memory, self.counters, seed, spp, mode)
 
-    def _prepared(self, scene, sensor, seed, spp, mode) -> Prepared:
-        prepared = prepare(self.call(scene, sensor, seed, spp, mode))
+    def _prepared(self, call: Call) -> Prepared:
+        prepared = prepare(call)
         self.plan = prepared.plan
         return prepared
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         require_integrator(self)
         view = find_sensor(scene, sensor)
-        if splits(view):
-            parts = parts_of(view, seed, spp)
-            return side_by_side([self.render_forward(scene, params, p.sensor, p.seed, p.spp) for p in parts])
+        if not splits(view):
+            return self._forward(self.call(scene, view, seed, spp))
+        parts = [self.call(scene, p.sensor, p.seed, p.spp, "forward", p.film) for p in parts_of(view, seed, spp)]
+        return side_by_side([self._forward(part) for part in parts])
+
+    def _forward(self, call: Call):
         with alone():
-            prepared = self._prepared(scene, sensor, seed, spp, "forward")
+            prepared = self._prepared(call)
             images = {term.name: term.forward(job) for term, job in prepared.jobs}
-            prepared.observe(seed, images)
-        return sum(images.values(), films.black(find_sensor(scene, sensor).film()))
+            prepared.observe(call.seed, images)
+        return sum(images.values(), films.black(call.film))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         require_integrator(self)
         view = find_sensor(scene, sensor)
-        if splits(view):
-            _require_gradient_image(grad_in, films.black(view.film()).shape)
-            parts = parts_of(view, seed, spp)
-            for k, p in enumerate(parts):
-                self.render_backward(scene, params, share(grad_in, k, len(parts)), p.sensor, p.seed, p.spp)
+        if not splits(view):
+            self._backward(self.call(scene, view, seed, spp, "backward"), grad_in)
             return
+        _require_gradient_image(grad_in, films.black(view.film()).shape)
+        parts = parts_of(view, seed, spp)
+        for k, p in enumerate(parts):
+            call = self.call(scene, p.sensor, p.seed, p.spp, "backward", p.film)
+            self._backward(call, share(grad_in, k, len(parts)))
+
+    def _backward(self, call: Call, grad_in) -> None:
         with alone():
-            prepared = self._prepared(scene, sensor, seed, spp, "backward")
-            _require_gradient_image(grad_in, films.black(find_sensor(scene, sensor).film()).shape)
+            prepared = self._prepared(call)
+            _require_gradient_image(grad_in, films.black(call.film).shape)
             for term, job in prepared.jobs:
                 term.backward(job, grad_in)
             dr.eval()

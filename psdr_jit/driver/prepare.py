@@ -79,7 +79,7 @@ class _Question:
 
 def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
-    film = call.sensor.film()
+    film = call.film
     require_film(film)
     given = _given(call.options)
     budgets = _budgets(call) if given is None else {t.name: t.spp for t in given.terms}
@@ -93,7 +93,7 @@ def prepare(call: Call) -> Prepared:
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
-        warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=4)
+        warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
     return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
 

@@ -15,7 +15,7 @@ from .kind import OnEdge, Side, Sight, Use
 from .kind_mesh import BetweenFaces, on_fixed, straight_point
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import LEAST_SLANT, clear_of_lift
+from .points import LEAST_SLANT, ROUNDING_LEAD, clear_of_lift
 from .rows import EdgeRows
 from .wedges import Wedges, meeting_wedges
 
@@ -49,15 +49,22 @@ class Junctions(BetweenFaces):
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         index = dr.gather(mi.UInt32, self.index, row, active)
         x, dx = bend(self.curves, index, *straight_point(self.rows, row, t, active), active)
-        return on_fixed(x, dx, self.centre, self._blur(row, x, active), active)
+        on = on_fixed(x, dx, self.centre, mi.Float(0), active)
+        on.lead += ROUNDING_LEAD * self._in_the_dark(row, x, active)
+        return on
 
-    def _blur(self, row: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> mi.Float:
+    def _in_the_dark(self, row: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> mi.Float:
         """How far beside the curve a point of one surface is in the shadow of the other, if that overhangs [m].
 
-        Mitsuba lifts rays off a surface along its normal: closer to the curve they start above what overhangs.
+        Mitsuba lifts rays off a surface along its normal, by h: where the surfaces meet at an angle φ (cos φ = n0·n1),
+        closer to the curve than h cot φ they start behind what overhangs. Distances are along the surface.
         """
-        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
-        return clear_of_lift(x) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
+        n0, n1 = self._normals(row, active)
+        cot = dr.abs(dr.dot(n0, n1)) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
+        return clear_of_lift(x) * cot
+
+    def _normals(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Normal3f, mi.Normal3f]:
+        return dr.gather(mi.Normal3f, self.rows.n0, row, active), dr.gather(mi.Normal3f, self.rows.n1, row, active)
 
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         side = dr.cross(dx, ω)
@@ -65,7 +72,20 @@ class Junctions(BetweenFaces):
         return dr.select(across > 0, side / across, 0), across, mi.Bool(False)
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
-        return Side.found_by(sight.beside(which))
+        """As far to the side as leads out of the dark on the surface in front there, and no farther.
+
+        Along a surface seen at a grazing angle, a step to the side is many times as long, and would lead across the
+        thin shadow that begins at the curve. Of a step along a surface with normal n, |n·ω| / |ω × curve| leads to the
+        side; in front is the surface with the larger n·s/(n·ω), s the direction to the side.
+        """
+        n0, n1 = self._normals(row, active)
+        s = dr.select(which == 0, -1.0, 1.0) * sight.n_perp
+        across = dr.norm(dr.cross(sight.ω, dr.normalize(dr.cross(n0, n1))))
+        f0, f1 = dr.dot(n0, sight.ω), dr.dot(n1, sight.ω)
+        in_front = dr.abs(dr.select(dr.dot(n0, s) / f0 > dr.dot(n1, s) / f1, f0, f1))
+        share = dr.select(in_front < across, in_front / across, 1)
+        step = sight.offset + share * self._in_the_dark(row, sight.at.x, active)
+        return Side.found_by(mi.Ray3f(sight.at.x + step * s - sight.lead * sight.ω, sight.ω))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         index = dr.gather(mi.UInt32, self.index, row, active)

@@ -36,7 +36,7 @@ def surface_at(
     families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
     families += [(grid, grid_surface) for grid in tubes.grids]
     met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
-    elsewhere = active
+    elsewhere = mi.Bool(active)  # a copy: the caller's mask is not ours to change
     for *_, on_curve in met:
         elsewhere &= ~on_curve
     si = pi.compute_surface_interaction(ray, flags, elsewhere)

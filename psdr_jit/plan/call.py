@@ -18,6 +18,7 @@ class Call:
     integrator: mi.CppADIntegrator  # provides Mitsuba's `sample_rays`
     scene: mi.Scene
     sensor: mi.Sensor
+    film: mi.Film  # of the sensor, or of its size
     options: Options
     memory: Memory  # the integrator's: outlives the call
     counters: Counters

@@ -1,7 +1,8 @@
 """Which form of the path integral suits a scene, as far as its structure tells; a pilot decides the rest.
 
 Where surfaces of different velocity touch, the geometry term of the material form has a derivative ~ Δv/r of infinite
-variance. The spatial form has no such kernel, but finds an edge at every visible crease.
+variance, whose integral is not absolutely convergent: it leaves out what light between the two does in the very corner.
+The spatial form has no such kernel, but finds an edge at every visible crease.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Job:
 
     @property
     def film(self) -> mi.Film:
-        return self.call.sensor.film()
+        return self.call.film
 
     @property
     def options(self) -> Options:

@@ -16,23 +16,36 @@ import numpy as np
 from ..core.film import black
 from .graph import child_objects, plugin_name
 
+#: By number of channels.
+PIXEL_FORMATS = {1: "luminance", 2: "luminance_alpha", 3: "rgb", 4: "rgba"}
+
 
 @dataclass(frozen=True)
 class Part:
     """One sensor of a batch. Its film has the size of its share of the image."""
 
     sensor: mi.Sensor
+    film: mi.Film  # its own, or one of that size with the filter and the channels of the batch's
     seed: Any  # int or mi.UInt32
     spp: int
 
 
 def splits(sensor: mi.Sensor) -> bool:
-    """Is it a batch whose sensors can be rendered one by one? Their films must be like the batch's own, uncropped."""
+    """Is it a batch whose sensors can be rendered one by one? Not if it is cropped.
+
+    Sensors come with films of their own, which may have other filters: what counts is the film of the batch. Where
+    these ask for samples beyond the border, the two must agree.
+    """
     if plugin_name(sensor) != "batch":
         return False
     film = sensor.film()
-    alike = all(_format(child.film()) == _format(film) for child in _sensors(sensor))
-    return alike and tuple(film.crop_size()) == tuple(film.size())
+    fits = is_uniform(sensor) or all(_border(f) == 0 for f in (film, *(child.film() for child in _sensors(sensor))))
+    return fits and _format(film)[1] in PIXEL_FORMATS and tuple(film.crop_size()) == tuple(film.size())
+
+
+def is_uniform(batch: mi.Sensor) -> bool:
+    """Are the films of all its sensors like its own?"""
+    return all(_format(child.film()) == _format(batch.film()) for child in _sensors(batch))
 
 
 def parts_of(sensor: mi.Sensor, seed: Any, spp: int) -> list[Part]:
@@ -40,7 +53,23 @@ def parts_of(sensor: mi.Sensor, seed: Any, spp: int) -> list[Part]:
     found = _sensors(sensor)
     for child in found:
         child.sampler().set_sample_count(sensor.sampler().sample_count())
-    return [Part(child, _seed(seed, k), spp) for k, child in enumerate(found)]
+    return [Part(child, _film(sensor.film(), child.film()), _seed(seed, k), spp) for k, child in enumerate(found)]
+
+
+def _film(of_batch: mi.Film, own: mi.Film) -> mi.Film:
+    """`own`, or what it would be with the format of the batch's film."""
+    if _format(own) == _format(of_batch):
+        return own
+    width, height = own.crop_size()
+    return mi.load_dict({
+        "type": "hdrfilm", "width": int(width), "height": int(height), "rfilter": of_batch.rfilter(),
+        "pixel_format": PIXEL_FORMATS[_format(of_batch)[1]], "component_format": "float32",
+    })  # fmt: skip
+
+
+def _border(film: mi.Film) -> int:
+    """How far beyond the image samples are taken [px]."""
+    return film.rfilter().border_size() if film.sample_border() else 0
 
 
 def _sensors(batch: mi.Sensor) -> list[mi.Sensor]:

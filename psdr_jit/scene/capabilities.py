@@ -128,7 +128,7 @@ SUPPORT = (
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
     Row("perspective, thin lens, orthographic sensor", "yes", ""),
-    Row("batch sensor", "yes", "its sensors are rendered one by one; they need films with its filter and pixel format"),
+    Row("batch sensor", "yes", "its sensors are rendered one by one, uncropped; `sample_border` needs equal filters"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes", ""),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),

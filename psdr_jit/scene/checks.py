@@ -96,7 +96,7 @@ def check_media(facts: SceneFacts) -> Iterator[Finding]:
 def check_sensor(facts: SceneFacts) -> Iterator[Finding]:
     """Moving edges must be projected onto the film."""
     if facts.geometry_moves and facts.sensor.plugin not in SUPPORTED_SENSORS:
-        alike = "; give each of its sensors a film with the rfilter and pixel_format of the batch, and crop none"
+        alike = "; crop none, set sample_border to false, or give each of its sensors the rfilter of the batch"
         way_out = alike if facts.sensor.plugin == "batch" else ""
         yield Finding(
             UnsupportedError, facts.sensor.name,

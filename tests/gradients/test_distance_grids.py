@@ -10,15 +10,19 @@ from helpers import fd, forward
 from test_linear_curves import EYE, scene_of
 
 from psdr_jit import make_plan
+from psdr_jit.core.ad import tangents
 from psdr_jit.core.memory import Memory
+from psdr_jit.core.records import Hit
 from psdr_jit.core.upload import in_memory
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import gain
 from psdr_jit.edges.grid_triangles import grid_triangles
 from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.paths.grid_surface import grid_surface
+from psdr_jit.plan.motion import SceneMotion
 from psdr_jit.scene.facts import analyse
 from psdr_jit.scene.grids import blends_normals, moving_grids
+from psdr_jit.scene.tubes import tubes_of
 
 ONE_TERM = {"type": "psdr_path", "form": "spatial", "sppc": 1, "max_depth": 2}
 
@@ -95,6 +99,22 @@ def test_its_surface_moves_with_its_values(llvm, normals):
         expected = np.array((value(met[0]) - value(met[1])) / (2 * h))[:, same]
         error = np.abs(np.array(dr.grad(value(si)))[:, same] - expected).max(0) / (np.abs(expected).max(0) + 0.1)
         assert np.quantile(error, 0.95) < 5e-3, name
+
+
+def test_points_that_a_ring_throws_shadows_on_move_with_it(llvm):
+    """Receivers on the grid itself: their displacement, asked for with the mask that says where there is a surface."""
+    scene = scene_of(ring=grid(torus(12)))
+    perturb(scene, "ring.grid").attach()
+    facts = analyse(scene)
+    tubes = tubes_of(scene, facts, Memory())
+    d = dr.normalize(mi.Point3f(mi.Float(0.6, 0.6, 3), mi.Float(0.1, -0.1, 3), 0) - mi.Point3f(*EYE))
+    ray = mi.Ray3f(mi.Point3f(*EYE), d)
+    hit = Hit.of(ray, scene.ray_intersect_preliminary(ray))
+    with SceneMotion(scene.sensors()[0], tubes).attached() as moving:
+        moved = tangents(moving.of_surface(hit))
+    speed = np.array(dr.norm(moved))
+    assert (speed[:2] > 0.5).all()
+    assert speed[2] == 0
 
 
 def test_triangles_lie_on_the_surface(llvm):

@@ -93,8 +93,12 @@ def test_they_are_updated_with_the_shapes(llvm):
     assert count() == there == count()
 
 
-def test_under_an_overhang_it_is_dark(llvm):
-    """A panel leans over the place where it meets the floor: no step of light there, however close one looks."""
+@pytest.mark.parametrize("tilt, lamp", [(78, 0.3), (12, 0.6355)], ids=["wide", "thin"])
+def test_under_an_overhang_it_is_dark(llvm, tilt, lamp):
+    """A panel leans over the place where it meets the floor: no step of light there, however close one looks.
+
+    The thin shadow ends 2 mm from the panel, which is a step of 0.1 mm to the side for who looks along the floor.
+    """
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     look = T().look_at(origin=[0.1, 0.2, 3], target=[0, 0, 0.05], up=[0, 1, 0])
@@ -102,8 +106,9 @@ def test_under_an_overhang_it_is_dark(llvm):
     scene = mi.load_dict({
         "type": "scene", "camera": {"type": "perspective", "fov": 4, "to_world": look, "film": film},
         "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(4), "bsdf": white},
-        "panel": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 78).scale(1.5), "bsdf": white},
-        "lamp": {"type": "point", "position": [0.2, 3, 0.3], "intensity": 10.0},
+        "panel": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], tilt).scale(1.5), "bsdf": white},
+        "lamp": {"type": "point", "position": [0.2, 3, lamp], "intensity": 10.0},
     }, optimize=False)  # fmt: skip
-    image = forward(perturb(scene, "panel.to_world", (0, 0, 1)), {"type": "psdr_path", "max_depth": 2}, 2, 64)
+    only_outlines = {"type": "psdr_path", "max_depth": 2, "sppc": 0, "sppd": 0, "sppi": 0, "spps": 0, "sppp": 64}
+    image = forward(perturb(scene, "panel.to_world", (0, 0, 1)), only_outlines, 2, 64)
     assert not image.any()

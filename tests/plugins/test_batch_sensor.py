@@ -77,6 +77,26 @@ def test_derivative_is_that_of_each_sensor(moved):
         assert slope == pytest.approx(1, abs=0.1)  # 0, -1 and 1/2 are not
 
 
+def test_the_film_of_the_batch_counts(moved):
+    """Sensors without a film of their own get Mitsuba's default, which filters otherwise."""
+    motion, look = moved, mi.ScalarTransform4f().look_at
+
+    def views(**own) -> dict:
+        pose = {"fov": 40, "to_world": look(ORIGINS[0], [0, -0.5, 0], [0, 1, 0])}
+        return {f"view{k}": {"type": "perspective", **pose, **own} for k in range(2)}
+
+    box = {"type": "hdrfilm", "width": 2 * RES, "height": RES, "pixel_format": "luminance", "rfilter": {"type": "box"}}
+    found = []
+    for own in ({}, {"film": {**box, "width": RES}}):
+        batch = mi.load_dict({"type": "batch", "film": box, **views(**own)})
+        motion.attach()
+        found.append(np.array(psdr().render_forward(motion.scene, motion.params, sensor=batch, seed=5)))
+        image = mi.render(motion.scene, sensor=batch, integrator=psdr(), spp=4)
+        assert image.shape == found[-1].shape == (RES, 2 * RES, 1)
+    assert np.abs(found[0]).max() > 0.05
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-4)
+
+
 def test_a_camera_of_the_batch_can_move(llvm):
     scene = batch_of()
     name = next(n for n in mi.traverse(scene).keys() if n.endswith("view1.to_world"))

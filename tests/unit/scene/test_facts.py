@@ -401,7 +401,7 @@ def test_sensors():
     for sensor in good:
         assert not complaints(facts_of(load(sensor=sensor), "floor.to_world"))
     facts = facts_of(load(sensor=batch), "floor.to_world")
-    with pytest.raises(UnsupportedError, match="pixel_format of the batch"):
+    with pytest.raises(UnsupportedError, match="rfilter of the batch"):
         require_supported(facts)
     assert not complaints(facts_of(load(sensor=batch), NOTHING_MOVES))
 
