@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.compat import mesh_faces, positions_buffer
+from ..core.compat import mesh_faces
 from ..core.memory import Memory, Slot
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
@@ -20,13 +20,6 @@ COARSE, COARSE_SHARE = 35.0, 0.02
 
 #: The same angle under a sky, through which the plane of every face passes.
 COARSE_UNDER_SKY = 20.0
-
-#: Angle between a shading normal and its face [degrees] from which, over `COARSE_SHARE` of the area, the horizons of
-#: the faces are worth samples (`horizons.py`).
-BENT = 5.0
-
-#: Of an integrator: by name of a mesh, its positions when it was looked at, kept alive, and whether it is bent.
-BENT_MESHES: Slot[dict[str, tuple[mi.Float, bool]]] = Slot(dict)
 
 #: Of an integrator: the meshes that have been looked at, by name.
 LOOKED_AT: Slot[set[str]] = Slot(set)
@@ -95,25 +88,6 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
     return found
 
 
-def coarse_meshes(faces: SmoothFaces, memory: Memory) -> list[bool]:
-    """By mesh: are its normals so far off its faces that their horizons matter? Remembered while it rests.
-
-    While a function is being frozen, values cannot be read: what has not been looked at counts as fine.
-    """
-    known, freezing = memory[BENT_MESHES], dr.flag(dr.JitFlag.FreezingScope)
-    buffers = [positions_buffer(mesh) for mesh in faces.meshes]
-    names = [mesh.id() for mesh in faces.meshes]
-    new = [i for i, (name, b) in enumerate(zip(names, buffers, strict=True))
-           if name not in known or known[name][0].index != b.index]  # fmt: skip
-    if new and not freezing:
-        area, coarse = _bent_area(faces, BENT)
-        for i in new:
-            own = faces.rows.shape == i
-            share = dr.sum(dr.select(own, coarse, 0)) / dr.sum(dr.select(own, area, 0))
-            known[names[i]] = (buffers[i], float(share[0]) > COARSE_SHARE)
-    return [name in known and known[name][1] for name in names]
-
-
 def warn_about_coarse(faces: SmoothFaces, limit: float, memory: Memory) -> None:
     """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
 
@@ -123,7 +97,13 @@ def warn_about_coarse(faces: SmoothFaces, limit: float, memory: Memory) -> None:
     unknown = [i for i, mesh in enumerate(faces.meshes) if mesh.id() not in memory[LOOKED_AT]]
     if not unknown or dr.flag(dr.JitFlag.FreezingScope):
         return
-    area, coarse = _bent_area(faces, limit)
+    p, n = faces.corners(faces.rows.corner, mi.Bool(True))
+    n_g = dr.cross(p[1] - p[0], p[2] - p[0])
+    area = dr.norm(n_g)
+    least = mi.Float(1)
+    for n_s in n:
+        least = dr.minimum(least, dr.abs(dr.dot(n_s, n_g)) / (dr.norm(n_s) * area))
+    coarse = dr.select(least < math.cos(math.radians(limit)), area, 0)
     for i in unknown:
         memory[LOOKED_AT].add(faces.meshes[i].id())
         own = faces.rows.shape == i
@@ -137,17 +117,6 @@ def warn_about_coarse(faces: SmoothFaces, limit: float, memory: Memory) -> None:
                 UnsupportedWarning,
                 memory,
             )
-
-
-def _bent_area(faces: SmoothFaces, limit: float) -> tuple[mi.Float, mi.Float]:
-    """By face: twice its area, and the same where a corner's normal is more than `limit` degrees off it, else 0."""
-    p, n = faces.corners(faces.rows.corner, mi.Bool(True))
-    n_g = dr.cross(p[1] - p[0], p[2] - p[0])
-    area = dr.norm(n_g)
-    least = mi.Float(1)
-    for n_s in n:
-        least = dr.minimum(least, dr.abs(dr.dot(n_s, n_g)) / (dr.norm(n_s) * area))
-    return area, dr.select(least < math.cos(math.radians(limit)), area, 0)
 
 
 def _joined(parts: list[FaceRows]) -> FaceRows:
