@@ -13,7 +13,8 @@ the boundary integral of [Zhang et al. 2020, §5] with the segment's measure wri
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
-brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`).
+brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`), and so
+do the planes of coarse smooth-shaded faces (`horizons.py`).
 """
 
 from __future__ import annotations
@@ -185,13 +186,11 @@ SHADOWS = SecondaryTerm(
 
 
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
-    """What the term consists of, each with its share of the samples: shadows, and steps that lights bring along."""
-    beside = [LIGHT_STEPS] if job.facts.has_light_steps else []
-    if any(shape.smooth for shape in job.facts.shapes):
-        beside.append(HORIZONS)
-    if not beside:
+    """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
+    others = [LIGHT_STEPS, SHADOWS] if job.facts.has_light_steps else [SHADOWS]
+    if len(others) == 1 and not any(shape.smooth for shape in job.facts.shapes):
         return [(SHADOWS, job)]
-    return shared_out(job, [*beside, SHADOWS])
+    return shared_out(job, HORIZONS, others)
 
 
 def forward(job: Job) -> mi.TensorXf:

@@ -10,6 +10,7 @@ emits (that is the direct term, in material form), traced with common random num
 silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the
 view of a sliding x_D. It is the boundary integral of [Zhang et al. 2020, §5], two-sided because directions, not
 points, are kept.
+The planes of coarse smooth-shaded faces take a part of the samples (`horizons.py`).
 The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond the first vertex past the edge.
 """
 
@@ -133,7 +134,7 @@ def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     edges = ESTIMATORS[job.form]
     if not any(shape.smooth for shape in job.facts.shapes):
         return [(edges, job)]
-    return horizons.shared_out(job, [HORIZONS[job.form], edges])
+    return horizons.shared_out(job, HORIZONS[job.form], [edges])
 
 
 def forward(job: Job) -> mi.TensorXf:

@@ -8,12 +8,13 @@ import mitsuba as mi
 from ..core.memory import Slot
 from ..core.sensor_frame import viewpoint
 from ..core.varying import varying
+from ..edges.coarse import bent_meshes
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.horizons import Horizons, Targets
 from ..edges.kind_shading import ShadingOutlines
 from ..edges.scene_table import scene_edges
 from ..edges.shading_curve import Face
-from ..edges.smooth_faces import SmoothFaces, coarse_meshes
+from ..edges.smooth_faces import SmoothFaces
 from ..plan.job import Job
 from .rows import ROW_SAMPLER, SampledRows, row_state
 
@@ -75,14 +76,14 @@ def horizon_weights(job: Job, term: str, direct: bool) -> list[mi.Float]:
     at_ball = dr.select(straddled, lit / dr.maximum(spread, 1e-6) * angle / near, 0)
     weight *= dr.select(to.radius > 0, at_ball, 1)
     relevant = mi.Bool(True) if _sources_move(job, direct) else rows.moves
-    chosen = dr.gather(mi.UInt32, _flags(coarse_meshes(table.faces, job.call.memory)), rows.shape) != 0
+    chosen = dr.gather(mi.UInt32, _flags(bent_meshes(table.faces.meshes, job.call.memory)), rows.shape) != 0
     return [dr.select(relevant & chosen & dr.isfinite(weight), weight, 0)]
 
 
 def _faces(job: Job) -> SmoothFaces | None:
     """The faces of smooth-shaded meshes, if one of these is coarse."""
     kinds = [kind for kind in scene_edges(job).kinds if isinstance(kind, ShadingOutlines)]
-    if not kinds or not any(coarse_meshes(kinds[0].faces, job.call.memory)):
+    if not kinds or not any(bent_meshes(kinds[0].faces.meshes, job.call.memory)):
         return None
     return kinds[0].faces
 
