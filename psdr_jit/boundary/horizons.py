@@ -3,6 +3,10 @@
 `edges/horizons.py` derives them. A segment starts at its receiver x_D, a point of the face, and two rays from just
 above and just below the face look for its source. Particles that arrive at x_D along the face carry no flux and have
 infinite importance: they are taken a small angle off the plane, with the cosine as a factor, which cancels.
+
+Where a face cuts into another surface, its plane meets that surface in the line of contact. There 1/r goes to infinity,
+and in the material form the interior term goes to the opposite infinity, up to the height at which Mitsuba lifts its
+rays. So rays are lifted as much here, and r is cut off as there (`per_length`).
 """
 
 from __future__ import annotations
@@ -128,6 +132,12 @@ def sides(job: Job, line: HorizonLine) -> HorizonSides | None:
     return HorizonSides(both, which, ray, job.scene.ray_intersect_preliminary(ray, coherent=False))
 
 
+def per_length(on: HorizonPoint, r: mi.Float) -> mi.Float:
+    """1/r_B of a source at the distance r along a lifted ray: r²/ρ³, ρ its distance from x_D itself."""
+    far2 = dr.square(r) + dr.square(on.offset)
+    return dr.square(r) / (far2 * dr.sqrt(far2))
+
+
 def partner_agrees(pi: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Do both sides end at the same point? Then nothing steps there. Lanes as of `sides`. Evaluates."""
     t, code = dr.select(pi.is_valid(), pi.t, 0), Hit.of(mi.Ray3f(0, 0), pi).shape
@@ -161,7 +171,7 @@ def trace_lights(job: Job, horizons: SampledHorizons, line: HorizonLine) -> LitH
         source=Hit.of(ray, pi),
         receiver=end,
         ratio=dr.select(finite, 1.0, 0.0),
-        value=-L * line.weight * (cos / (r * line.pdf)),
+        value=-L * line.weight * (cos * per_length(on, r) / line.pdf),
         wavelengths=line.wavelengths,
     )
     return compact(lit, active & dr.any(L != 0))
@@ -190,7 +200,7 @@ def view(line: HorizonLine, r: mi.Float) -> EdgeView:
     at = EdgeLocation(line.row, line.t, on.x + r * on.ω, mi.Point3f(0), mi.Float(0))
     # with the distance as lead, rays beside the edge start at x_D
     sight = Sight(at, on.ω, r, on.n, on.offset, lead=r)
-    return EdgeView(line.lane, sight, end, line.weight * (cos / r), line.pdf, line.wavelengths)
+    return EdgeView(line.lane, sight, end, line.weight * (cos * per_length(on, r)), line.pdf, line.wavelengths)
 
 
 def trace_views(job: Job, horizons: SampledHorizons, line: HorizonLine) -> EdgeView | None:

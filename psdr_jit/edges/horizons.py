@@ -31,7 +31,7 @@ import mitsuba as mi
 
 from .kind import Side, Sight
 from .location import EdgeLocation
-from .points import clearance
+from .points import MITSUBA_LIFT
 from .shading_curve import Face
 from .smooth_faces import FaceRows, SmoothFaces
 
@@ -56,7 +56,7 @@ class HorizonPoint:
     ω: mi.Vector3f  # unit
     n: mi.Vector3f  # unit, of the face
     size: mi.Float  # of the face [m]
-    offset: mi.Float  # at which rays start above and below the face [m]
+    offset: mi.Float  # at which Mitsuba starts rays above and below the face [m]
     pdf: mi.Float  # per area and angle, given the row
     target: mi.UInt32
     pi: mi.PreliminaryIntersection3f  # x on its face
@@ -69,7 +69,6 @@ class Horizons:
 
     faces: SmoothFaces
     targets: Targets
-    centre: mi.Point3f  # of the scene
 
     @property
     def per_face(self) -> int:
@@ -124,7 +123,7 @@ class Horizons:
             ω=dr.select(ball, ω_ball, ω_all),
             n=n,
             size=face.size,
-            offset=clearance(x, face.size, self.centre)[0],
+            offset=MITSUBA_LIFT * (1 + dr.max(dr.abs(x))),
             pdf=dr.select(ball, dr.rcp(2 * half), pdf_all) / face.area,
             target=row % self.per_face,
             pi=pi,

@@ -7,7 +7,6 @@ import mitsuba as mi
 
 from ..core.memory import Slot
 from ..core.sensor_frame import viewpoint
-from ..core.varying import varying
 from ..edges.coarse import bent_meshes
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.horizons import Horizons, Targets
@@ -50,8 +49,7 @@ def horizons(job: Job, term: str, direct: bool) -> Horizons | None:
     if not known:
         faces = _faces(job)
         targets = None if faces is None else (_lights(job) if direct else _all_around())
-        centre = varying(mi.Point3f, list(job.scene.bbox().center()))
-        known.append(None if targets is None else Horizons(faces, targets, centre))
+        known.append(None if targets is None else Horizons(faces, targets))
     return known[0]
 
 

@@ -78,8 +78,8 @@ def sheet(**children: dict) -> mi.Mesh:
     x, y = (a.ravel() for a in np.meshgrid(ticks, ticks, indexing="ij"))
     i, j = (a.ravel() for a in np.meshgrid(np.arange(4), np.arange(4), indexing="ij"))
     a, b, c, d = 5 * i + j, 5 * i + 5 + j, 5 * i + 6 + j, 5 * i + j + 1
-    normals = np.stack([0.7 * x, 0.7 * y, 1 + 0 * x], -1)
-    points = np.stack([x, y, -0.35 * (x * x + y * y)], -1)
+    normals = np.stack([x, y, 1 + 0 * x], -1)
+    points = np.stack([x, y, -0.5 * (x * x + y * y)], -1)
     return smooth_mesh(points, normals, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), **children)
 
 
