@@ -30,7 +30,7 @@ LOOKED_AT: Slot[set[str]] = Slot(set)
 def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
     """By mesh: are its normals so far off its faces that their horizons matter? Remembered while it rests.
 
-    While a function is being frozen, values cannot be read: what has not been looked at counts as fine.
+    While a function is being frozen, values cannot be read: what has not been looked at counts as bent, which is safe.
     """
     return [_is_bent(mesh, memory) for mesh in meshes]
 
@@ -44,7 +44,7 @@ def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
         with dr.suspend_grad():
             known = (buffers, _bent_share(mesh, BENT) > BENT_SHARE)
         memory[BENT_MESHES][name] = known
-    return known is not None and known[1]
+    return known is None or known[1]
 
 
 def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> None:
