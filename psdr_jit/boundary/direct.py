@@ -13,12 +13,13 @@ the boundary integral of [Zhang et al. 2020, §5] with the segment's measure wri
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
-brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`).
+brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`), and so
+do the planes of coarse smooth-shaded faces (`horizons.py`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -37,11 +38,14 @@ from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
+from ..sampling.horizons import horizon_weights
 from ..sampling.light_steps import light_step_weights
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
 from . import segment_motion
+from .horizons import LIGHTS as HORIZONS
+from .horizons import shared_out
 from .light_lines import LightLine, sample_light_lines
 from .light_steps import ESTIMATOR as LIGHT_STEPS
 from .segment_motion import BoundarySamples, SecondaryTerm
@@ -182,12 +186,11 @@ SHADOWS = SecondaryTerm(
 
 
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
-    """What the term consists of, each with its share of the samples: shadows, and steps that lights bring along."""
-    if not job.facts.has_light_steps:
+    """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
+    others = [LIGHT_STEPS, SHADOWS] if job.facts.has_light_steps else [SHADOWS]
+    if len(others) == 1 and not any(shape.smooth for shape in job.facts.shapes):
         return [(SHADOWS, job)]
-    with dr.suspend_grad():
-        found = [part for part in (LIGHT_STEPS, SHADOWS) if part.edges(job) is not None]
-    return [(part, replace(job, spp=max(1, job.spp // len(found)))) for part in found]
+    return shared_out(job, HORIZONS, others)
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -224,13 +227,20 @@ def cost(form: str, sky: bool) -> float:
 TERM = Term(
     name=NAME,
     budget="sppd",
-    streams=(Stream.DIRECT_EDGE, Stream.DIRECT_SUBPATH, Stream.LIGHT_STEP, Stream.LIGHT_STEP_SUBPATH),
+    streams=(
+        Stream.DIRECT_EDGE,
+        Stream.DIRECT_SUBPATH,
+        Stream.LIGHT_STEP,
+        Stream.LIGHT_STEP_SUBPATH,
+        Stream.HORIZON,
+        Stream.HORIZON_SUBPATH,
+    ),
     needed=needed,
     cost=cost,
     forward=forward,
     backward=backward,
     edges=EdgeSampling(
-        lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job),
+        lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job) + horizon_weights(job, NAME, direct=True),
         "no light sees the others as an outline, or they are coplanar",
     ),
 )

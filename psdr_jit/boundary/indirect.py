@@ -10,6 +10,7 @@ emits (that is the direct term, in material form), traced with common random num
 silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the
 view of a sliding x_D. It is the boundary integral of [Zhang et al. 2020, §5], two-sided because directions, not
 points, are kept.
+The planes of coarse smooth-shaded faces take a part of the samples (`horizons.py`).
 The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond the first vertex past the edge.
 """
 
@@ -18,6 +19,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core import film as films
 from ..core.streams import Stream
 from ..edges.kind import Use
 from ..edges.table import EdgeTable, look_beside
@@ -26,9 +28,10 @@ from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
+from ..sampling.horizons import horizon_weights, sampled_horizons
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
-from . import indirect_material, segment_motion
+from . import horizons, indirect_material, segment_motion
 from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
@@ -110,6 +113,40 @@ ESTIMATORS = {
     ),
 }
 
+#: The same for the horizons of coarse smooth-shaded faces.
+HORIZONS = {
+    form: SecondaryTerm(
+        edges=lambda job: sampled_horizons(job, NAME, direct=False),
+        longest=longest_subpath,
+        sample=horizons.sample_views,
+        trace=trace,
+        evaluate=worth,
+    )
+    for form, trace, worth in (
+        ("spatial", horizons.trace_views, evaluate),
+        ("material", horizons.trace_backgrounds, indirect_material.evaluate),
+    )
+}
+
+
+def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
+    """What the term consists of, each with its share of the samples: edges, and horizons if faces are coarse."""
+    edges = ESTIMATORS[job.form]
+    if not any(shape.smooth for shape in job.facts.shapes):
+        return [(edges, job)]
+    return horizons.shared_out(job, HORIZONS[job.form], [edges])
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image of the term along the tangents set on the scene's parameters. Detached."""
+    return sum((segment_motion.forward(share, part) for part, share in parts(job)), films.black(job.film))
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`, same samples."""
+    for part, share in parts(job):
+        segment_motion.backward(share, part, grad_in)
+
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Surfaces see each other, and something moves in their view."""
@@ -132,13 +169,13 @@ def cost(form: str, sky: bool) -> float:
 TERM = Term(
     name=NAME,
     budget="sppi",
-    streams=(Stream.INDIRECT_EDGE, Stream.INDIRECT_SUBPATH, Stream.INDIRECT_RADIANCE),
+    streams=(Stream.INDIRECT_EDGE, Stream.INDIRECT_SUBPATH, Stream.INDIRECT_RADIANCE, Stream.HORIZON_VIEW),
     needed=needed,
     cost=cost,
-    forward=lambda job: segment_motion.forward(job, ESTIMATORS[job.form]),
-    backward=lambda job, grad_in: segment_motion.backward(job, ESTIMATORS[job.form], grad_in),
+    forward=forward,
+    backward=backward,
     edges=EdgeSampling(
-        lambda job: line_weights(job, USES[job.form]),
+        lambda job: line_weights(job, USES[job.form]) + horizon_weights(job, NAME, direct=False),
         "the others are coplanar, or lie inside of closed surfaces",
     ),
 )

@@ -27,6 +27,9 @@ class Stream(IntEnum):
     CHAIN_CUTS = 13
     CHAIN_RADIANCE = 14
     CHAIN_GUIDE = 15
+    HORIZON = 16
+    HORIZON_SUBPATH = 17
+    HORIZON_VIEW = 18
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

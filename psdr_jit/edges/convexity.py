@@ -12,6 +12,7 @@ from ..core.sensor_frame import origin_box, sensor_frame
 from ..core.varying import varying
 from ..scene.capabilities import SUPPORTED_SENSORS
 from ..scene.facts import SceneFacts, ShapeFacts
+from .coarse import bent_meshes
 from .overlaps import apart
 from .shells import edge_shells
 from .topology import build_edge_topology
@@ -27,7 +28,10 @@ FLATNESS = 1e-5
 
 
 def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> str:
-    """Name of the scene's only shape if it is convex, opaque, and the sensor outside of its bounding box; else ""."""
+    """Name of the scene's only shape if it is convex, opaque, and the sensor outside of its bounding box; else "".
+
+    If it is shaded as something else, it hides from itself what shines on it: then it does not count as alone.
+    """
     if len(facts.shapes) != 1 or facts.sensor.plugin not in SUPPORTED_SENSORS:
         return ""
     only = facts.shapes[0]
@@ -35,6 +39,8 @@ def lone_convex(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: M
         return ""
     box, (lower, upper) = scene.bbox(), origin_box(sensor_frame(sensor))
     if not apart(lower, upper, box):
+        return ""
+    if only.smooth and all(bent_meshes([scene.shapes()[0]], memory)):
         return ""
     flat = only.plugin in ("disk", "rectangle")
     return only.name if flat or is_convex_body(scene.shapes()[0], only, memory) else ""

@@ -24,6 +24,7 @@ from ..scene.facts import ShapeFacts
 from ..scene.grids import VALUES, blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
+from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
@@ -42,7 +43,7 @@ from .rows import EdgeRows
 from .scene_grids import scene_grids
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
-from .smooth_faces import COARSE, COARSE_UNDER_SKY, smooth_faces, warn_about_coarse
+from .smooth_faces import smooth_faces
 from .solids import Ball
 from .table import EdgeTable
 
@@ -195,8 +196,10 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
     if faces is None:
         return []
     if job.options.depth_limit > 2 or any(not e.delta for e in job.facts.emitters):  # surfaces are lights as well
-        sky = job.scene.environment() is not None
-        warn_about_coarse(faces, COARSE_UNDER_SKY if sky else COARSE, job.call.memory)
+        limit = COARSE if job.scene.environment() is None else COARSE_UNDER_SKY
+        missing = [shape for shape, s in zip(shapes, meshes, strict=True)
+                   if s.smooth and (s.is_emitter or s.delta_lobes)]  # fmt: skip
+        warn_about_coarse(missing, limit, job.call.memory)
     return [ShadingOutlines(faces, centre)]
 
 

@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import mesh_faces
-from ..core.memory import Memory, Slot
-from ..core.warn_once import warn_once
-from ..errors import UnsupportedWarning
+from ..core.memory import Memory
 from .segments import attached_positions, is_smooth, known_topology
-
-#: Angle between a shading normal and its face [degrees], and share of the area from which a mesh is bent that far, at
-#: which shading and shape no longer belong together.
-COARSE, COARSE_SHARE = 35.0, 0.02
-
-#: The same angle under a sky, through which the plane of every face passes.
-COARSE_UNDER_SKY = 20.0
-
-#: Of an integrator: the meshes that have been looked at, by name.
-LOOKED_AT: Slot[set[str]] = Slot(set)
 
 
 @dataclass
@@ -86,37 +73,6 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
     )
     dr.eval(rows, found.positions, found.normals)
     return found
-
-
-def warn_about_coarse(faces: SmoothFaces, limit: float, memory: Memory) -> None:
-    """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
-
-    Such a face still reflects light along its own plane. Where that plane passes through a light, or through a surface
-    that sends light, as much of it as sinks below the plane is lost in a step, which no edge of the mesh stands for.
-    """
-    unknown = [i for i, mesh in enumerate(faces.meshes) if mesh.id() not in memory[LOOKED_AT]]
-    if not unknown or dr.flag(dr.JitFlag.FreezingScope):
-        return
-    p, n = faces.corners(faces.rows.corner, mi.Bool(True))
-    n_g = dr.cross(p[1] - p[0], p[2] - p[0])
-    area = dr.norm(n_g)
-    least = mi.Float(1)
-    for n_s in n:
-        least = dr.minimum(least, dr.abs(dr.dot(n_s, n_g)) / (dr.norm(n_s) * area))
-    coarse = dr.select(least < math.cos(math.radians(limit)), area, 0)
-    for i in unknown:
-        memory[LOOKED_AT].add(faces.meshes[i].id())
-        own = faces.rows.shape == i
-        share = dr.sum(dr.select(own, coarse, 0)) / dr.sum(dr.select(own, area, 0))
-        if float(share[0]) > COARSE_SHARE:
-            warn_once(
-                f"mesh '{faces.meshes[i].id()}' is shaded with normals that are more than {limit:g} degrees off its "
-                "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
-                "reflects is missing from the derivative; split its normals at sharp edges, set face_normals, or use "
-                "a finer mesh",
-                UnsupportedWarning,
-                memory,
-            )
 
 
 def _joined(parts: list[FaceRows]) -> FaceRows:

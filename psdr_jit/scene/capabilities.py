@@ -118,8 +118,8 @@ _MOVING = "while geometry, a light's pose or the camera is differentiated; "
 SUPPORT = (
     Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
     Row("smooth-shaded meshes", "yes",
-        "where normals turn away is an edge; light from such a mesh onto others: 1 to 5 % off; normals far off their "
-        "faces: warning"),
+        "where normals turn away is an edge, and so is the plane of a face far off its normals; light from such a mesh "
+        "onto others: 1 to 5 % off; lights and mirrors with normals far off their faces: warning"),
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, SDF grids with unequal numbers of values along the axes: error"),
     Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),

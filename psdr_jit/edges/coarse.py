@@ -1,0 +1,86 @@
+"""Which smooth-shaded meshes have normals far off their faces: too far for shading and shape to belong together."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.compat import mesh_buffers, mesh_faces, mesh_positions
+from ..core.memory import Memory, Slot
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+
+#: Angle between a shading normal and its face [degrees] from which the horizons of the faces (`horizons.py`) are worth
+#: samples, and share of the area from which a mesh is bent that far.
+BENT, BENT_SHARE = 5.0, 0.02
+
+#: Angle [degrees] from which, over the same share, what no horizon stands for is worth a warning; and under a sky,
+#: through which the plane of every face passes.
+COARSE, COARSE_UNDER_SKY = 35.0, 20.0
+
+#: Of an integrator: by name of a mesh, its arrays when it was looked at, kept alive, and whether it is bent.
+BENT_MESHES: Slot[dict[str, tuple[tuple, bool]]] = Slot(dict)
+
+#: Of an integrator: the meshes that have been looked at for a warning, by name.
+LOOKED_AT: Slot[set[str]] = Slot(set)
+
+
+def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
+    """By mesh: are its normals so far off its faces that their horizons matter? Remembered while it rests.
+
+    While a function is being frozen, values cannot be read: what has not been looked at counts as bent, which is safe.
+    """
+    return [_is_bent(mesh, memory) for mesh in meshes]
+
+
+def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
+    name, buffers = mesh.id(), mesh_buffers(mesh)
+    known = memory[BENT_MESHES].get(name)
+    # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
+    new = known is None or [b.index for b in known[0]] != [b.index for b in buffers]
+    if new and not dr.flag(dr.JitFlag.FreezingScope):
+        with dr.suspend_grad():
+            known = (buffers, _bent_share(mesh, BENT) > BENT_SHARE)
+        memory[BENT_MESHES][name] = known
+    return known is None or known[1]
+
+
+def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> None:
+    """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
+
+    For meshes that shine or mirror: of what they send, as much as sinks below the plane of one of their faces is lost
+    in a step, which neither an edge nor a horizon stands for.
+    """
+    unknown = [mesh for mesh in meshes if mesh.id() not in memory[LOOKED_AT]]
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return
+    for mesh in unknown:
+        memory[LOOKED_AT].add(mesh.id())
+        with dr.suspend_grad():
+            share = _bent_share(mesh, limit)
+        if share > BENT_SHARE:
+            warn_once(
+                f"mesh '{mesh.id()}' is shaded with normals that are more than {limit:g} degrees off its "
+                "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
+                "reflects is missing from the derivative; split its normals at sharp edges, set face_normals, or use "
+                "a finer mesh",
+                UnsupportedWarning,
+                memory,
+            )
+
+
+def _bent_share(mesh: mi.Mesh, limit: float) -> float:
+    """Share of the area in faces of which a corner's normal is more than `limit` degrees off."""
+    faces = mesh_faces(mesh)
+    positions = dr.detach(mesh_positions(mesh))
+    p = [dr.gather(mi.Point3f, positions, faces[k]) for k in range(3)]
+    n_g = dr.cross(p[1] - p[0], p[2] - p[0])
+    area = dr.norm(n_g)
+    least = mi.Float(1)
+    for k in range(3):
+        n_s = mi.Vector3f(dr.detach(mesh.vertex_normal(faces[k])))
+        least = dr.minimum(least, dr.abs(dr.dot(n_s, n_g)) / (dr.norm(n_s) * area))
+    bent = dr.select(least < math.cos(math.radians(limit)), area, 0)
+    return float((dr.sum(bent) / dr.sum(area))[0])

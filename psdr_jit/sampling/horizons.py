@@ -1,0 +1,139 @@
+"""Which horizon, and towards what: in proportion to what it may part."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.memory import Slot
+from ..core.sensor_frame import viewpoint
+from ..edges.coarse import bent_meshes
+from ..edges.film_cover import LENS_CENTRE
+from ..edges.horizons import Horizons, Targets
+from ..edges.kind_shading import ShadingOutlines
+from ..edges.scene_table import scene_edges
+from ..edges.shading_curve import Face
+from ..edges.smooth_faces import SmoothFaces
+from ..plan.job import Job
+from .rows import ROW_SAMPLER, SampledRows, row_state
+
+#: Lights that are looked at one by one; if there are more, directions are drawn all around.
+MOST_LIGHTS = 16
+
+#: A face that the middle of the sensor sees from behind, or edge-on, counts as much as one seen at this cosine; so does
+#: one whose normals seem to turn away from a light.
+LEAST = 0.1
+
+#: Of one render call: the horizons by term, in a list so that none can be told from not asked for.
+TABLES: Slot[dict[str, list[Horizons | None]]] = Slot(dict)
+
+
+class SampledHorizons(SampledRows):
+    """The horizons of a scene, and how their rows are drawn."""
+
+    table: Horizons
+
+
+def sampled_horizons(job: Job, term: str, direct: bool) -> SampledHorizons | None:
+    """Horizons before lights (`direct`), or before whatever reflects light; None without any that moves."""
+    table = horizons(job, term, direct)
+    if table is None:
+        return None
+    state = row_state(job, f"{term}/horizons", lambda: horizon_weights(job, term, direct))
+    return None if state is None else SampledHorizons(table, job.call.memory[ROW_SAMPLER], state)
+
+
+def horizons(job: Job, term: str, direct: bool) -> Horizons | None:
+    """Built once per render call."""
+    known = job.shared[TABLES].setdefault(term, [])
+    if not known:
+        faces = _faces(job)
+        targets = None if faces is None else (_lights(job) if direct else _all_around())
+        known.append(None if targets is None else Horizons(faces, targets))
+    return known[0]
+
+
+def horizon_weights(job: Job, term: str, direct: bool) -> list[mi.Float]:
+    """The relative weight of each row, in a list of one; of none without any."""
+    table = horizons(job, term, direct)
+    if table is None:
+        return []
+    row = dr.arange(mi.UInt32, table.count)
+    rows, face = table.face(row)
+    n = dr.normalize(face.n_g)
+    n_s = dr.normalize(face.n[0] + face.n[1] + face.n[2])
+    middle, spread = face.at(mi.Point2f(1 / 3)), _spread(face)
+    weight = face.area * spread * _seen(job, rows.shell, n, middle)
+    to = table.target(row)
+    d = to.centre - middle
+    far = dr.norm(d)
+    lit = dr.minimum(dr.maximum(dr.dot(n_s, d) / far, 0) + LEAST * spread, spread)
+    straddled = dr.abs(dr.dot(n, d)) < to.radius + dr.maximum(far, face.size) * 1e-6
+    angle = dr.pi * dr.minimum(to.radius / far, 1)
+    near = dr.maximum(far, to.radius)
+    at_ball = dr.select(straddled, lit / dr.maximum(spread, 1e-6) * angle / near, 0)
+    weight *= dr.select(to.radius > 0, at_ball, 1)
+    relevant = mi.Bool(True) if _sources_move(job, direct) else rows.moves
+    chosen = dr.gather(mi.UInt32, _flags(bent_meshes(table.faces.meshes, job.call.memory)), rows.shape) != 0
+    return [dr.select(relevant & chosen & dr.isfinite(weight), weight, 0)]
+
+
+def _faces(job: Job) -> SmoothFaces | None:
+    """The faces of smooth-shaded meshes, if one of these is coarse."""
+    kinds = [kind for kind in scene_edges(job).kinds if isinstance(kind, ShadingOutlines)]
+    if not kinds or not any(bent_meshes(kinds[0].faces.meshes, job.call.memory)):
+        return None
+    return kinds[0].faces
+
+
+def _flags(values: list[bool]) -> mi.UInt32:
+    found = mi.UInt32([int(value) for value in values])
+    dr.make_opaque(found)
+    return found
+
+
+def _lights(job: Job) -> Targets | None:
+    """Balls around lights with a surface, and the whole circle under a sky; None if all are points or directions."""
+    chosen = [(e, f) for e, f in zip(job.scene.emitters(), job.facts.emitters, strict=True) if not f.delta]
+    if len(chosen) > MOST_LIGHTS:
+        return _all_around()
+    spheres = []
+    for emitter, facts in chosen:
+        if facts.shape >= 0:
+            shape = job.scene.shapes()[job.facts.shapes[facts.shape].index]
+            ball = shape.bbox().bounding_sphere()
+            spheres.append([*ball.center, float(ball.radius)])
+        else:
+            spheres.append([0.0, 0.0, 0.0, 0.0])
+    if not spheres:
+        return None
+    x, y, z, r = (mi.Float([s[k] for s in spheres]) for k in range(4))
+    emitters = mi.EmitterPtr([e for e, _ in chosen]) if len(chosen) > 1 else mi.EmitterPtr(chosen[0][0])
+    targets = Targets(mi.Point3f(x, y, z), r, dr.reinterpret_array(mi.UInt32, emitters))
+    dr.make_opaque(targets)
+    return targets
+
+
+def _all_around() -> Targets:
+    targets = Targets(mi.Point3f(0), mi.Float(0), mi.UInt32(0))
+    dr.make_opaque(targets)
+    return targets
+
+
+def _sources_move(job: Job, direct: bool) -> bool:
+    """Can anything but the faces themselves move against their horizons?"""
+    facts = job.facts
+    return facts.shapes_move and (direct or job.form == "material")
+
+
+def _spread(face: Face) -> mi.Float:
+    """Mean sine of the angle between the corners' normals and the face."""
+    n = dr.normalize(face.n_g)
+    return sum(dr.norm(dr.cross(n, dr.normalize(n_s))) for n_s in face.n) / 3
+
+
+def _seen(job: Job, shell: mi.Float, n: mi.Vector3f, x: mi.Point3f) -> mi.Float:
+    """Cosine at which the middle of the sensor sees the faces; not 0 for those that others may see."""
+    eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
+    cos = dr.dot(n, dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(x)))
+    return dr.maximum(dr.select(shell != 0, cos * shell, dr.abs(cos)), 0) + LEAST
