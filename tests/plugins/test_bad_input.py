@@ -198,8 +198,9 @@ def test_hidden_emitters():
     ({"c": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}},
      UnsupportedError, "medium"),
     ({"sensor": {"type": "batch", "film": {"type": "hdrfilm", "width": 8, "height": 4}, "a": {"type": "perspective"},
-                 "b": {"type": "perspective", "film": {"type": "hdrfilm", "rfilter": {"type": "box"}}}}},
-     UnsupportedError, "rfilter and pixel_format"),
+                 "b": {"type": "perspective",
+                       "film": {"type": "hdrfilm", "rfilter": {"type": "mitchell"}, "sample_border": True}}}},
+     UnsupportedError, "the rfilter of the batch"),
     ({"box": {"type": "cube", "bsdf": {"type": "hair"}}}, UnsupportedError, "use a rough BSDF"),
 ])  # fmt: skip
 def test_scenes_that_are_refused_while_something_moves(scene, error, words):
