@@ -139,6 +139,12 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} is stretched or sheared, which Mitsuba renders as an unstretched one; scale it "
                 "evenly, or use a mesh",
             )  # fmt: skip
+        if shape.turned_grid:
+            yield Finding(
+                SceneError, shape.name,
+                f"{label} is turned or mirrored by its to_world, which Mitsuba does not support: it shades it as if it "
+                "was not; put it into a shapegroup and turn an instance of it",
+            )  # fmt: skip
 
 
 def check_instances(facts: SceneFacts) -> Iterator[Finding]:

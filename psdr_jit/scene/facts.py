@@ -26,6 +26,7 @@ from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
     is_cubic,
+    is_turned_grid,
     is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
@@ -54,6 +55,7 @@ class ShapeFacts:
     is_emitter: bool
     has_medium: bool
     uneven_scale: bool  # a sphere or cylinder under a transform that Mitsuba does not model
+    turned_grid: bool  # a grid of signed distances under one
     bsdf: str  # plugin, as written in XML
     bsdf_flags: int  # mi.BSDFFlags
     delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
@@ -248,6 +250,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         is_emitter=shape.is_emitter(),
         has_medium=shape.is_medium_transition(),
         uneven_scale=is_unevenly_scaled(graph, shape, plugin),
+        turned_grid=is_turned_grid(graph, shape, plugin),
         bsdf=plugin_name(bsdf) if bsdf is not None else "none",
         bsdf_flags=bsdf.flags() if bsdf is not None else 0,
         delta_lobes=delta_lobes(graph, bsdf),

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_positions
-from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS
+from .capabilities import FRAME_FREE_PLUGINS, GRID_SHAPES, JUMPING_PLUGINS
 from .names import plugin_name, traverse
 from .params import parameter_value
 
@@ -203,6 +203,17 @@ def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
 def is_cubic(graph: SceneGraph, shape: mi.Shape) -> bool:
     """Has a grid as many values along each axis? Mitsuba 3.9 mixes the axes up where it has not."""
     return len(set(graph.value(shape, "grid").shape[:3])) == 1
+
+
+def is_turned_grid(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
+    """Does the pose of a grid of signed distances turn it? Mitsuba 3.9 warns of that, and its normals are wrong."""
+    if plugin not in GRID_SHAPES:
+        return False
+    matrix = _host(graph.value(shape, "to_world").matrix)
+    if matrix is None:
+        return False
+    left, _, right = np.linalg.svd(matrix.reshape(4, 4)[:3, :3])
+    return bool(np.abs(left @ right - np.eye(3)).max() > UNEVEN_SCALE)
 
 
 def stretches(matrix: np.ndarray, plugin: str) -> bool:

@@ -559,3 +559,14 @@ def test_mesh_buffers():
     p, f = compat.mesh_positions(box), compat.mesh_faces(box)
     assert (dr.width(p), dr.width(f)) == (24, 12)
     assert dr.allclose(compat.pack_positions(p), mi.traverse(box)[compat.VERTEX_POSITIONS])
+
+
+@pytest.mark.parametrize("degrees", [0, 20])
+def test_turned_grids(degrees):
+    """Mitsuba shades them as if they were not turned; instances of them it does turn."""
+    grid = np.linalg.norm(np.mgrid[-1:1:4j, -1:1:4j, -1:1:4j], axis=0)[..., None].astype(np.float32) - 0.8
+    pose = mi.ScalarTransform4f().rotate([0, 0.6, 0.8], degrees).scale([1, 2, 1])
+    sdf = {"type": "sdfgrid", "grid": mi.TensorXf(grid), "bsdf": {"type": "diffuse"}}
+    turned = load(x={**sdf, "to_world": pose})
+    assert complaints(facts_of(turned, "floor.to_world")) == ([(SceneError, "x")] if degrees else [])
+    assert not complaints(facts_of(turned, NOTHING_MOVES))
