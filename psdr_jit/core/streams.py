@@ -27,6 +27,7 @@ class Stream(IntEnum):
     CHAIN_CUTS = 13
     CHAIN_RADIANCE = 14
     CHAIN_GUIDE = 15
+    LIGHT_SUBPATH = 16
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:
