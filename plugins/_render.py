@@ -24,8 +24,10 @@ from psdr_jit.scene.io import find_sensor
 class TermIntegrator(ADIntegrator):
     """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's `path`, unless it says more."""
 
+    bidirectional = False  # can it trace light subpaths?
+
     def __init__(self, props):
-        self.options = Options.from_properties(props, [term.budget for term in TERMS])
+        self.options = Options.from_properties(props, [term.budget for term in TERMS], self.bidirectional)
         if self.options.plan_is_given:
             Plan.from_json(self.options.plan)  # raises now what would be found at the first derivative
         super().__init__(props)
