@@ -72,9 +72,9 @@ def find_paths(job: Job, seed: mi.UInt32, spp: int, limits: PathLimits) -> Light
     sound = turn_around(job, path, start, _Subpaths(vertices, lane), limits, records)
     records.count = dr.select(sound, path.count, 0)
     records.wavelengths = wavelengths
+    dr.eval(sound, records.count, records.vertices)  # at once: what is read later would go over the paths again
     if job.facts.geometry_moves:
         job.call.counters.grazing.count(~sound)
-    dr.eval(records.count, records.vertices)
     return LightTraced(records, path, wavelengths, weight)
 
 

@@ -156,9 +156,9 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
     records.wavelengths = ray.wavelengths
+    dr.eval(records.count, records.vertices, records.whole)  # at once: what is read later would trace the paths again
     if facts.geometry_moves:
         job.call.counters.grazing.count(records.cut())
-    dr.eval(records.count, records.vertices)
     return records, lane
 
 
