@@ -24,8 +24,8 @@ class BidirectionalIntegrator(TermIntegrator):
          (Default: auto)
 
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small
-    sources send through rough glass, or by way of rough mirrors, has less noise. Each camera sample comes with one
-    light subpath. What light subpaths alone could find, point and spot lights through smooth glass, is not shown.
+    sources send through rough glass, or by way of rough mirrors, has less noise. Each camera sample comes with two
+    light subpaths. What light subpaths alone could find, point and spot lights through smooth glass, is not shown.
     """
 
     bidirectional = True

@@ -23,6 +23,9 @@ from ..scene.facts import SceneFacts, ShapeFacts
 #: Lights that are traced. Where the others are, camera paths find them alone.
 TRACED = ("area", "point", "spot")
 
+#: Light subpaths for each camera sample: of 1, 2, 4, … the one with the least variance × seconds under rough glass.
+PER_SAMPLE = 2
+
 #: Surface vertices of a light subpath, at most; longer paths are left to the camera's.
 LONGEST = 8
 
@@ -36,7 +39,7 @@ class LightPlan:
 
     runs: bool
     reason: str
-    per_sample: int = 1  # light subpaths for each camera sample
+    per_sample: int = PER_SAMPLE  # light subpaths for each camera sample
 
     def __str__(self) -> str:
         return f"{self.per_sample} per camera sample: {self.reason}" if self.runs else f"none: {self.reason}"
