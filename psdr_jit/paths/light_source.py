@@ -135,14 +135,26 @@ def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int]
         owners.append(0 if owner is None else of_shape[owner])
         density[ids[k]] = 1 / (len(lights) * area)
         choice[ids[k]] = float(mi.Float(scene.pdf_emitter(k))[0])
-    boxes = [shapes[k].bbox() for k in targets]
-    if len(boxes) > most:
+    balls = [_ball(shapes[k]) for k in targets]
+    if len(balls) > most:
         whole = mi.ScalarBoundingBox3f()
-        for box in boxes:
-            whole.expand(box)
-        boxes = [whole]
-    spheres = [box.bounding_sphere() for box in boxes]
-    balls = tuple((varying(mi.Point3f, list(s.center)), varying(mi.Float, MARGIN * float(s.radius))) for s in spheres)
+        for k in targets:
+            whole.expand(shapes[k].bbox())
+        sphere = whole.bounding_sphere()
+        balls = [(sphere.center, sphere.radius)]
+    stored = tuple((varying(mi.Point3f, list(c)), varying(mi.Float, MARGIN * float(r))) for c, r in balls)
     tables = mi.UInt32([ids[k] for k in lights]), mi.UInt32(owners), mi.Float(density), mi.Float(choice)
     dr.make_opaque(*tables)
-    return LightSources(*tables, balls)
+    return LightSources(*tables, stored)
+
+
+def _ball(shape: mi.Shape) -> tuple[mi.ScalarPoint3f, float]:
+    """A ball about the middle of the shape's box that holds the shape: `(centre, radius)`."""
+    box = shape.bbox()
+    centre = box.center()
+    if shape.class_name() == "Sphere":
+        return centre, max(box.extents()) / 2
+    if shape.is_mesh():
+        corners = shape.vertex_position(dr.arange(mi.UInt32, shape.vertex_count()))
+        return centre, float(dr.max(dr.norm(dr.detach(corners) - mi.Point3f(centre)))[0])
+    return centre, box.bounding_sphere().radius

@@ -28,6 +28,9 @@ Z_LIMIT = 5.0
 TOLERANCE = 1e-5  # of the adjoint identity
 
 
+QUICK = {"form": "spatial", "sppc": 4, "sppp": 0, "sppi": 0}  # no pilot, the interior term alone
+
+
 def bdpt(light_paths: str = "auto", **options) -> dict:
     return {"type": "psdr_bdpt", "light_paths": light_paths, **LIMITS, **options}
 
@@ -168,6 +171,12 @@ def test_forward_and_backward_are_transposes(variant, param):
         assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
 
 
+def test_several_passes_are_transposes_too(llvm):
+    integrator = integrator_specs.build(bdpt(record_mib=16, **QUICK))
+    wJv, JTwv, w, Jv = adjoint_identity(load(GLASS, res=64), "lamp.to_world", integrator)
+    assert Jv > 1e-6 and abs(wJv - JTwv) <= TOLERANCE * w * Jv
+
+
 def test_later_calls_compile_nothing(llvm):
     motion = perturb(load(GLASS, res=16), "lamp.to_world", X)
     compiled = kernels_compiled(motion, integrator_specs.build(bdpt(sppc=8, sppd=0)), calls=6, spp=0)
@@ -185,17 +194,17 @@ def test_nearly_smooth_glass_is_finite(llvm):
 
 def test_the_plan_says_why(llvm):
     lit = load(GLASS, res=16)
-    plan = make_plan(lit, "lamp.to_world", integrator=bdpt())
+    plan = make_plan(lit, "lamp.to_world", integrator=bdpt(**QUICK))
     assert plan.light.runs and "'ball' may focus light" in str(plan)
     assert Plan.from_json(plan.to_json()) == plan
-    assert make_plan(lit, "lamp.to_world", integrator={"type": "psdr_path", **LIMITS}).light is None
+    assert make_plan(lit, "lamp.to_world", integrator={"type": "psdr_path", **QUICK}).light is None
     for scene, options, reason in (
         (load(Problem("point_shadow", "", 0.0)), {}, "nothing is focused"),
         (load(Problem("rough_dielectric", "", 0.0)), {}, "no light is of the kinds"),
         (lit, {"max_depth": 2}, "max_depth = 2"),
     ):
         name = next(key for key in mi.traverse(scene).keys() if key.endswith("to_world"))
-        plan = make_plan(scene, name, integrator={**bdpt(), **options})
+        plan = make_plan(scene, name, integrator={**bdpt(**QUICK), **options})
         assert not plan.light.runs and reason in plan.light.reason and "none: " in str(plan)
 
 
@@ -211,10 +220,10 @@ def test_a_given_plan_is_executed(llvm):
 
 def test_points_behind_smooth_glass_are_warned_about(llvm):
     with pytest.warns(UnsupportedWarning, match=r"light of 'lamp' \(spot\) that 'body' mirrors or bends"):
-        make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator=bdpt())
+        make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator=bdpt(**QUICK))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator={"type": "psdr_path", **LIMITS})
+        make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator={"type": "psdr_path", **QUICK})
 
 
 def test_words(llvm):
