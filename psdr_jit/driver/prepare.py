@@ -165,7 +165,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
         terms = decide(TERMS, q.facts, call.options, geometry, spp)
-        return make_plan_of(terms, call.options, form, why, plan_light(q.facts, call.options, call.memory))
+        return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
 
     plan = made(budgets, (forms[0], reason), "equal")
     automatic = q.automatic and len(plan.running) > 1

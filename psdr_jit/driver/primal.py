@@ -33,7 +33,7 @@ def bidirectional_image(call: Call) -> mi.TensorXf | None:
     if call.options.light_paths == "off":
         return None
     facts = analyse(call.scene, call.sensor)
-    light = plan_light(facts, call.options, call.memory)
+    light = plan_light(call.scene, facts, call.options, call.memory)
     if not light.runs:
         return None
     films.require_film(call.sensor.film())

@@ -6,6 +6,7 @@ near the mirrored or bent direction (`paths.light_technique.focuses`), and a sce
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -28,6 +29,9 @@ PER_SAMPLE = 2
 
 #: Surface vertices of a light subpath, at most; longer paths are left to the camera's.
 LONGEST = 8
+
+#: Size of a surface relative to the scene from which on there is nothing to aim at: a floor or a wall.
+SPANS = 0.8
 
 #: Surfaces that subpaths are aimed at one by one.
 MOST_TARGETS = 8
@@ -67,13 +71,21 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     ]
 
 
-def focusing_shapes(facts: SceneFacts) -> list[int]:
-    """Numbers of the shapes in the scene that may gather light on others."""
+def rough_shapes(facts: SceneFacts) -> list[int]:
+    """Numbers of the shapes in the scene that scatter light near one direction, and not diffusely as well."""
     glossy, diffuse = int(mi.BSDFFlags.Glossy), int(mi.BSDFFlags.Diffuse)
     return [s.index for s in facts.shapes if s.index >= 0 and s.bsdf_flags & glossy and not s.bsdf_flags & diffuse]
 
 
-def plan_light(facts: SceneFacts, options: Options, memory: Memory | None) -> LightPlan | None:
+def focusing_shapes(scene: mi.Scene, facts: SceneFacts) -> list[int]:
+    """Those of them that may gather light on others, and that one can aim at."""
+    sizes = {k: scene.shapes()[k].bbox().extents() for k in rough_shapes(facts)}
+    return [k for k, size in sizes.items() if math.hypot(*size) < SPANS * facts.extent]
+
+
+def plan_light(
+    scene: mi.Scene, facts: SceneFacts, options: Options, memory: Memory | None
+) -> LightPlan | None:
     """Whether light subpaths are traced; None of an integrator that does not know them, or is not to use them.
 
     Warns of light that one might expect them to find, once per `memory`.
@@ -81,10 +93,11 @@ def plan_light(facts: SceneFacts, options: Options, memory: Memory | None) -> Li
     if options.light_paths == "off":
         return None
     _warn_about_unseen_light(facts, memory)
-    targets = focusing_shapes(facts)
+    targets = focusing_shapes(scene, facts)
     for obstacle, reason in (
-        (not targets, "no surface is rough glass or a rough mirror, nothing is focused"),
+        (not rough_shapes(facts), "no surface is rough glass or a rough mirror, nothing is focused"),
         (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)}"),
+        (not targets, "rough glass and rough mirrors span the scene, there is nothing to aim at"),
         (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
         (facts.sensor.plugin not in KINDS.values(), f"nothing is connected to a '{facts.sensor.plugin}' sensor"),
     ):
@@ -102,7 +115,7 @@ def light_technique(
     `prunes`: what has no derivative is left out. While nothing but lights without a shape changes, that is the light of
     all others.
     """
-    lights, targets = traced_lights(facts), focusing_shapes(facts)
+    lights, targets = traced_lights(facts), focusing_shapes(scene, facts)
     if prunes and _only_lights_change(facts):
         lights = [k for k in lights if facts.emitters[k].pose or facts.emitters[k].radiance]
     if not (lights and targets):

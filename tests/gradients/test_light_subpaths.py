@@ -112,7 +112,7 @@ def test_image_of(llvm, scene):
     assert_image_of_path(glass_scene(**scene), bdpt("only"), 512)
 
 
-@pytest.mark.parametrize("name", ["cbox", "spot_light", "point_shadow"])
+@pytest.mark.parametrize("name", ["cbox", "spot_light", "point_shadow", "glossy_floor"])
 def test_without_caustics_nothing_changes(llvm, name):
     """The image and the derivative are those of the same kernels."""
     scene = load(Problem(name, "", 0.0), res=16)
@@ -201,6 +201,7 @@ def test_the_plan_says_why(llvm):
     for scene, options, reason in (
         (load(Problem("point_shadow", "", 0.0)), {}, "nothing is focused"),
         (load(Problem("rough_dielectric", "", 0.0)), {}, "no light is of the kinds"),
+        (load(Problem("glossy_floor", "", 0.0)), {}, "nothing to aim at"),
         (lit, {"max_depth": 2}, "max_depth = 2"),
     ):
         name = next(key for key in mi.traverse(scene).keys() if key.endswith("to_world"))
