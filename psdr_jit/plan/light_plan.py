@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 
 from ..core.memory import Memory
@@ -93,6 +94,8 @@ def plan_light(
     if options.light_paths == "off":
         return None
     _warn_about_unseen_light(facts, memory)
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return LightPlan(False, "where lights and surfaces are cannot be read while a function is being frozen")
     targets = focusing_shapes(scene, facts)
     for obstacle, reason in (
         (not rough_shapes(facts), "no surface is rough glass or a rough mirror, nothing is focused"),

@@ -227,6 +227,20 @@ def test_points_behind_smooth_glass_are_warned_about(llvm):
         make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator={"type": "psdr_path", **QUICK})
 
 
+def test_a_frozen_function_renders(llvm):
+    """Nothing can be read there: the image is that of `path`."""
+    scene = load(GLASS, res=16)
+    path, ours = (mi.load_dict({"type": t, "max_depth": 4}) for t in ("path", "psdr_bdpt"))
+
+    @dr.freeze
+    def frozen(seed: mi.UInt32) -> mi.TensorXf:
+        return mi.render(scene, integrator=ours, spp=4, seed=seed)
+
+    for seed in range(2):
+        image = mi.render(scene, integrator=path, spp=4, seed=mi.UInt32(seed))
+        assert np.allclose(frozen(mi.UInt32(seed)), image)
+
+
 def test_words(llvm):
     with pytest.raises(RuntimeError, match="light_paths = 'maybe': use off, auto or only"):
         mi.load_dict({"type": "psdr_bdpt", "light_paths": "maybe"})
