@@ -15,10 +15,12 @@ from helpers import adjoint_identity, assert_grad_close, fd, forward, functional
 from problems import Problem
 
 from psdr_jit import make_plan
+from psdr_jit.cli.main import main
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.plan.plan import Plan
+from psdr_jit.scene import io as scene_io
 
 X, Y = (1, 0, 0), (0, 1, 0)
 LIMITS = {"max_depth": 5, "rr_depth": 1000}
@@ -239,6 +241,19 @@ def test_a_frozen_function_renders(llvm):
     for seed in range(2):
         image = mi.render(scene, integrator=path, spp=4, seed=mi.UInt32(seed))
         assert np.allclose(frozen(mi.UInt32(seed)), image)
+
+
+def test_the_command_line_knows_it(llvm, tmp_path, capsys):
+    """By name, or because a scene file asks for it."""
+    shipped = scene_io.shipped_scene("rough_glass.xml")
+    own = tmp_path / "own.xml"
+    own.write_text(shipped.read_text(encoding="utf-8").replace('type="path"', 'type="psdr_bdpt"'), encoding="utf-8")
+    wanted = ["--wrt", "ball.bsdf.eta", "-D", "res=16"]
+    for argv in (["plan", str(shipped), "--integrator", "psdr_bdpt", *wanted], ["plan", str(own), *wanted]):
+        assert main(argv) == 0
+        assert "'ball' may focus light" in capsys.readouterr().out
+    assert main(["plan", str(shipped), *wanted]) == 0
+    assert "light" not in capsys.readouterr().out.split("term ")[0]
 
 
 def test_words(llvm):
