@@ -26,6 +26,7 @@ X, Y = (1, 0, 0), (0, 1, 0)
 LIMITS = {"max_depth": 5, "rr_depth": 1000}
 GLASS = Problem("rough_glass", "lamp.to_world", 0.01, direction=X)
 SEEDS = 16
+SLOW = pytest.mark.slow
 Z_LIMIT = 5.0
 TOLERANCE = 1e-5  # of the adjoint identity
 
@@ -114,7 +115,9 @@ def test_image_of(llvm, scene):
     assert_image_of_path(glass_scene(**scene), bdpt("only"), 512)
 
 
-@pytest.mark.parametrize("name", ["cbox", "spot_light", "point_shadow", "glossy_floor"])
+@pytest.mark.parametrize("name", [
+    "spot_light", "glossy_floor", pytest.param("cbox", marks=SLOW), pytest.param("point_shadow", marks=SLOW)
+])
 def test_without_caustics_nothing_changes(llvm, name):
     """The image and the derivative are those of the same kernels."""
     scene = load(Problem(name, "", 0.0), res=16)
@@ -128,7 +131,7 @@ def test_without_caustics_nothing_changes(llvm, name):
     assert np.allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(a).max())
 
 
-@pytest.mark.parametrize("light_paths", ["auto", "only"])
+@pytest.mark.parametrize("light_paths", [pytest.param("auto", marks=SLOW), "only"])
 def test_spot_moved(variant, light_paths):
     scene = load(GLASS, res=16)
     motion = perturb(scene, "lamp.to_world", X)
@@ -151,7 +154,7 @@ def test_derivative_by(llvm, param, how, options):
     assert_grad_close(estimate, fd(motion, {"type": "path", **LIMITS}, 0.006, 32, 4096), max_stderr=0.05)
 
 
-@pytest.mark.parametrize("form", ["spatial", "material"])
+@pytest.mark.parametrize("form", ["spatial", pytest.param("material", marks=SLOW)])
 def test_same_flow_however_found(llvm, form):
     """The interior term alone, where every vertex slides: what the light finds against what the camera finds.
 
@@ -160,11 +163,14 @@ def test_same_flow_however_found(llvm, form):
     scene = glass_scene(alpha=0.5)
     motion = perturb(scene, "camera.to_world", X)
     budgets = dict(max_depth=4, form=form, sppc=1, sppp=0, sppi=0)
-    by_camera, by_light = (forward(motion, bdpt(how, **budgets), SEEDS, 512) for how in ("off", "only"))
+    by_camera, by_light = (forward(motion, bdpt(how, **budgets), SEEDS, 256) for how in ("off", "only"))
     assert_grad_close(by_light, by_camera, max_stderr=0.06)
 
 
-@pytest.mark.parametrize("param", ["lamp.to_world", "ball.to_world", "camera.to_world", "ball.bsdf.eta"])
+@pytest.mark.parametrize("param", [
+    "lamp.to_world", "ball.bsdf.eta", pytest.param("ball.to_world", marks=SLOW),
+    pytest.param("camera.to_world", marks=SLOW),
+])  # fmt: skip
 def test_forward_and_backward_are_transposes(variant, param):
     for form in ("spatial",) if param.endswith("eta") else ("spatial", "material"):
         integrator = integrator_specs.build(bdpt(form=form))
