@@ -18,6 +18,7 @@ INK, LIGHT = "0.15", "0.75"
 #: method -> (colour, line style, marker); luminance and dashes tell them apart without colour.
 STYLES = {
     "psdr_path": ("#000000", "-", "o"),
+    "psdr_bdpt": ("#4d4d4d", "--", "h"),
     "prb": ("#8c8c8c", ":", "x"),
     "prb_projective, no guiding": ("#c1272d", "--", "s"),
     "prb_projective, small octree": ("#e07b00", "-.", "^"),

@@ -159,6 +159,7 @@ def prb_reparam(problem: Problem, budget: float, max_first: float) -> Renders:
 OURS = Method("psdr_path", "ours", mitsuba_integrator("psdr_path"))
 METHODS = (
     OURS,
+    Method("psdr_bdpt", "other", mitsuba_integrator("psdr_bdpt")),
     Method("prb", "other", mitsuba_integrator("prb")),
     Method("prb_projective, no guiding", "projective", mitsuba_integrator("prb_projective", guiding="none")),
     Method("prb_projective, small octree", "projective",

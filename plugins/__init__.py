@@ -14,7 +14,7 @@ import mitsuba as mi
 from psdr_jit.errors import UnsupportedError
 from psdr_jit.setup.llvm_guard import require_working_llvm, warn_without_backend
 
-_INTEGRATORS, _BSDFS = ("psdr_path",), ("psdr_dielectric", "psdr_plastic")
+_INTEGRATORS, _BSDFS = ("psdr_path", "psdr_bdpt"), ("psdr_dielectric", "psdr_plastic")
 
 
 def _refuse(props: mi.Properties) -> None:

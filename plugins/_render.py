@@ -12,7 +12,7 @@ from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
 from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.driver.terms import TERMS
-from psdr_jit.errors import ParameterError
+from psdr_jit.errors import ParameterError, PsdrError
 from psdr_jit.options import Options
 from psdr_jit.plan.call import Call
 from psdr_jit.plan.plan import Plan
@@ -22,10 +22,12 @@ from psdr_jit.scene.io import find_sensor
 
 
 class TermIntegrator(ADIntegrator):
-    """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's `path`."""
+    """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's `path`, unless it says more."""
+
+    bidirectional = False  # can it trace light subpaths?
 
     def __init__(self, props):
-        self.options = Options.from_properties(props, [term.budget for term in TERMS])
+        self.options = Options.from_properties(props, [term.budget for term in TERMS], self.bidirectional)
         if self.options.plan_is_given:
             Plan.from_json(self.options.plan)  # raises now what would be found at the first derivative
         super().__init__(props)
@@ -46,10 +48,16 @@ class TermIntegrator(ADIntegrator):
         require_integrator(self)
         view = find_sensor(scene, sensor)
         films.require_samples(view, spp)
-        if not (splits(view) and is_uniform(view)):
+        if not splits(view):
+            return self.primal(scene, view, seed, spp, develop, evaluate)
+        if not is_uniform(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
-        return side_by_side([self._path.render(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
+        return side_by_side([self.primal(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
+
+    def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
+        """The image itself, by one sensor."""
+        return self._path.render(scene, sensor, seed, spp, develop, evaluate)
 
     def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
         """A render call of this integrator as data; `film`: in place of the sensor's own."""
@@ -99,6 +107,19 @@ class TermIntegrator(ADIntegrator):
 
     def to_string(self):
         return f"{type(self).__name__}[{self.options}]"
+
+
+def register(name: str, integrator: type[TermIntegrator]) -> None:
+    """Let Mitsuba load `integrator` as the plugin `name`."""
+
+    def make(props: mi.Properties) -> TermIntegrator:
+        """Mitsuba prints all frames that an error has passed through: as few as possible."""
+        try:
+            return integrator(props)
+        except PsdrError as error:
+            raise error.with_traceback(None) from None
+
+    mi.register_integrator(name, make)
 
 
 def _require_gradient_image(grad_in, expected) -> None:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
-from psdr_jit.errors import PsdrError
-
-from ._render import TermIntegrator
+from ._render import TermIntegrator, register
 
 
 class PathSpaceIntegrator(TermIntegrator):
@@ -61,12 +57,4 @@ class PathSpaceIntegrator(TermIntegrator):
     """
 
 
-def _make(props: mi.Properties) -> PathSpaceIntegrator:
-    """Mitsuba prints all frames that an error has passed through: as few as possible."""
-    try:
-        return PathSpaceIntegrator(props)
-    except PsdrError as error:
-        raise error.with_traceback(None) from None
-
-
-mi.register_integrator("psdr_path", _make)
+register("psdr_path", PathSpaceIntegrator)

@@ -20,6 +20,9 @@ PLANS = ("lean", "full")
 #: Forward mode may rely on the direction that is set on the parameters: what has velocity 0 is left out as well.
 DIRECTIONS = ("any", "known")
 
+#: Light subpaths: none; where the plan finds a use for them; the same, but what they find is left to them alone, for
+#: comparison.
+LIGHT_PATHS = ("off", "auto", "only")
 
 #: The options that hold a term's samples per pixel, and which of them follows another one where it is not set.
 BUDGETS = ("sppc", "sppp", "spps", "sppi", "sppd")
@@ -48,6 +51,7 @@ class Options:
     plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS
     more_budgets: tuple[tuple[str, int | None], ...] = ()  # of terms that bring a budget of their own, by name
+    light_paths: str = "off"  # one of LIGHT_PATHS; a property of the integrators that can trace them
 
     def __post_init__(self):
         for name, default in _properties():
@@ -62,7 +66,8 @@ class Options:
             self._require_type(name, value, None)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
-        for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS)):
+        for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS),
+                            ("light_paths", LIGHT_PATHS)):  # fmt: skip
             if getattr(self, name) not in words and not (name == "plan" and self.plan_is_given):
                 raise OptionError(f"{name} = {getattr(self, name)!r}: use {', '.join(words[:-1])} or {words[-1]}")
         if self.record_mib < 16:
@@ -87,10 +92,14 @@ class Options:
             require_count(name, value, f' (<integer name="{name}" .../> in a scene file)')
 
     @staticmethod
-    def from_properties(props, budgets: Iterable[str] = ()) -> Options:
-        """Read every field from Mitsuba `Properties`, and `budgets` that are none; the loader rejects what is left."""
+    def from_properties(props, budgets: Iterable[str] = (), bidirectional: bool = False) -> Options:
+        """Read every field from Mitsuba `Properties`, and `budgets` that are none; the loader rejects what is left.
+
+        `bidirectional`: of an integrator that can trace light subpaths, which it then does where the plan says so.
+        """
         more = tuple((name, props.get(name, None)) for name in dict.fromkeys(budgets) if name not in BUDGETS)
-        return Options(**{name: props.get(name, default) for name, default in _properties()}, more_budgets=more)
+        own = {"light_paths": props.get("light_paths", "auto")} if bidirectional else {}
+        return Options(**{name: props.get(name, default) for name, default in _properties()}, more_budgets=more, **own)
 
     @property
     def _budgets(self) -> dict[str, int | None]:
@@ -118,8 +127,9 @@ class Options:
 
 
 def _properties() -> list[tuple[str, object]]:
-    """`(name, default)` of the fields that are properties of the integrator."""
-    return [(field.name, field.default) for field in fields(Options) if field.name != "more_budgets"]
+    """`(name, default)` of the fields that are properties of every integrator."""
+    special = ("more_budgets", "light_paths")
+    return [(field.name, field.default) for field in fields(Options) if field.name not in special]
 
 
 def require_count(name: str, value, hint: str = "") -> None:

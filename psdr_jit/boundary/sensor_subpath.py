@@ -31,8 +31,8 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
-from ..paths.rays import SHADOW_EPSILON, skip_emitters
 from ..paths.scattering import UNIFORM_SHARE
+from ..paths.sensor_connection import on_film, seen_by_sensor
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 from .delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
@@ -212,21 +212,11 @@ def _connect(job: Job, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active
     aperture = sampler.next_2d() if frame.kind == "thinlens" else mi.Point2f(0.5)
     view = look_at(frame, si.p, aperture)
     to_sensor = -view.ω
-    lower, upper = frame.window
-    seen = active & view.valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
-    seen &= (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
+    seen = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
+    seen &= on_film(frame, view)
     f = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(to_sensor), seen)
     W = value * f * particle_correction(si, to_sensor) / view.J_px
-    seen &= dr.any(W != 0)
-    if job.options.hide_emitters:  # the sensor looks through them
-        seen &= si.shape.emitter() == None  # noqa: E711 (an array comparison)
-        ray = mi.Ray3f(view.o, view.ω)
-        ray.maxt = view.r * (1 - SHADOW_EPSILON)
-        pi = job.scene.ray_intersect_preliminary(ray, active=seen)
-        _, pi = skip_emitters(job.scene, ray, pi)
-        seen &= ~pi.is_valid()
-    else:
-        seen &= ~job.scene.ray_test(si.spawn_ray_to(view.o), seen)
+    seen = seen_by_sensor(job.scene, si, view, job.options.hide_emitters, seen & dr.any(W != 0))
     return _AtSensor(view, aperture, dr.select(seen, W, 0))
 
 

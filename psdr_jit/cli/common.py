@@ -45,6 +45,12 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
                         help="override a <default> of the scene file; may be repeated")
 
 
+def add_integrator_argument(parser: argparse.ArgumentParser) -> None:
+    """Which of our integrators: for the commands that differentiate."""
+    parser.add_argument("--integrator", metavar="NAME",
+                        help="psdr_path or psdr_bdpt (default: the scene's own, or psdr_path)")
+
+
 def definitions(args: argparse.Namespace) -> dict[str, str]:
     """The -D options as a dictionary."""
     for item in args.define:
@@ -84,11 +90,12 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, st
 
 
 def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:
-    """The scene's own `psdr_path` with all its options, or ours with the scene's path lengths."""
+    """The scene's own integrator with all its options if it is one of ours, or ours with the scene's path lengths."""
     from psdr_jit.derivative import integrator_specs
     from psdr_jit.scene import io as scene_io
 
-    named = getattr(args, "integrator", None) or integrator_specs.DEFAULT_INTEGRATOR
     own = scene_io.integrator_properties(args.scene, **definitions(args))
+    default = own["type"] if own.get("type") in integrator_specs.OURS else integrator_specs.DEFAULT_INTEGRATOR
+    named = getattr(args, "integrator", None) or default
     given: Mapping[str, Any] | str = own if own.get("type") == named else named
     return integrator_specs.integrator_spec(scene, given, max_depth=args.max_depth)

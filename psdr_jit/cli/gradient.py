@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check", action="store_true", help="compare with finite differences as well")
     parser.add_argument("--check-seconds", type=float, default=120, metavar="S",
                         help="time limit of the check (default: 120)")
-    parser.add_argument("--integrator", help=argparse.SUPPRESS)
+    common.add_integrator_argument(parser)
     parser.add_argument("--quiet", action="store_true", help="print only errors and the check's verdict")
 
 

@@ -21,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--spp", type=int, metavar="N", help="samples per pixel (default: the scene's own)")
     parser.add_argument("--max-depth", type=int, metavar="N", help="path length (default: the scene's own)")
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    common.add_integrator_argument(parser)
 
 
 def run(args: argparse.Namespace) -> int:

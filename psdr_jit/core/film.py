@@ -47,16 +47,16 @@ def _put(block: mi.ImageBlock, film: mi.Film, pos, value, alpha, weight, wavelen
 
 
 def develop_samples(
-    film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool
+    film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool, alpha: mi.Float | float = 0.0
 ) -> mi.TensorXf:
     """Weighted mean of per-sample values as Mitsuba's renderers form it; attached where `value` is.
 
-    `pos`: film positions [px]. Alpha is constant along this term, so its derivative is written as 0.
+    `pos`: film positions [px]. `alpha`: of the samples; of a derivative 0, as it is constant along the interior term.
     """
     clear(film)
     block = film.create_block()
     block.set_coalesce(block.coalesce() and coalesce)
-    _put(block, film, pos, value, mi.Float(0), mi.Float(1), wavelengths, mi.Bool(True))
+    _put(block, film, pos, value, mi.Float(alpha), mi.Float(1), wavelengths, mi.Bool(True))
     film.put_block(block)
     return film.develop()
 

@@ -157,6 +157,14 @@ def towards_viewer(view: mi.Vector4f, x: mi.Point3f) -> mi.Vector3f:
     return mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(x)
 
 
+def pixel_footprint(frame: SensorFrame, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
+    """`View.J_px` of a point x (world) that is met by a viewing ray of direction ω, whichever lens point it is from."""
+    if frame.kind == "orthographic":
+        return mi.Float(frame.px_area * frame.stretch[0])
+    along = dr.normalize(frame.to_local @ ω)
+    return dr.square((frame.to_local @ x).z) * frame.px_area * along.z
+
+
 def look_at(frame: SensorFrame, x: mi.Point3f, aperture_sample: mi.Point2f) -> View:
     """Project x (world) as seen through one lens point.
 

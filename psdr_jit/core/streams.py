@@ -30,6 +30,7 @@ class Stream(IntEnum):
     HORIZON = 16
     HORIZON_SUBPATH = 17
     HORIZON_VIEW = 18
+    LIGHT_SUBPATH = 19
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

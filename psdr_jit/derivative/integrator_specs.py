@@ -21,6 +21,9 @@ from psdr_jit.plan.plan import Plan
 
 DEFAULT_INTEGRATOR = "psdr_path"
 
+# plugins whose derivative is the sum of our terms
+OURS = (DEFAULT_INTEGRATOR, "psdr_bdpt")
+
 # Mitsuba's own, for comparisons: term name, its sample budget
 PROJECTIVE_TERMS = (("interior", "sppc"), ("primary", "sppp"), ("secondary", "sppi"))
 
@@ -71,7 +74,7 @@ def integrator_spec(scene: Any, integrator: Mapping[str, Any] | str | None = Non
 
 def term_table(plugin: str) -> tuple[tuple[str, str], ...]:
     """(term, property with its sample budget, 0 for off) of each term of `plugin`; empty: not separable."""
-    if plugin == DEFAULT_INTEGRATOR:
+    if plugin in OURS:
         return tuple((term.name, term.budget) for term in TERMS)
     return PROJECTIVE_TERMS if plugin in ("prb_projective", "direct_projective") else ()
 

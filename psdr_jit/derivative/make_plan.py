@@ -27,7 +27,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
 
     Traces rays only where form or budgets depend on noise, for a pilot of a few samples per pixel. `params`: name or
     names of parameters that count as enabled as well, or the scene's `mi.SceneParameters` (nothing more). `sensor`: its
-    index, or the sensor. `integrator`: a `psdr_path`, a dict of its properties, or None. `spp`: as in `mi.render`, 0:
+    index, or the sensor. `integrator`: one of ours, a dict of its properties, or None. `spp`: as in `mi.render`, 0:
     what the integrator and the sampler say. The sizes of the edge sets are counted. Raises what rendering would raise:
     `OptionError`, `SceneError`, `UnsupportedError`.
     """
@@ -36,7 +36,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
     if not hasattr(integrator, "call"):
         integrator = build(integrator_spec(scene, integrator))
     if not hasattr(integrator, "call"):
-        raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path")
+        raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path or psdr_bdpt")
     names = [] if params is None or isinstance(params, mi.SceneParameters) else params
     names = [names] if isinstance(names, str) else list(names)
     with also_enabled(scene, names):

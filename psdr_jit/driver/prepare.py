@@ -22,6 +22,7 @@ from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
 from ..plan.job import Job, tubes_of_call
+from ..plan.light_plan import plan_light
 from ..plan.motion import SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan
 from ..plan.probe_motion import probe_motion
@@ -163,7 +164,8 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     forms, reason = forms_to_try(call.scene, q.facts, call.options)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
-        return make_plan_of(decide(TERMS, q.facts, call.options, geometry, spp), call.options, form, why)
+        terms = decide(TERMS, q.facts, call.options, geometry, spp)
+        return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
 
     plan = made(budgets, (forms[0], reason), "equal")
     automatic = q.automatic and len(plan.running) > 1
@@ -198,7 +200,7 @@ def _geometry(q: _Question, prunes: bool) -> Geometry:
 def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:
     """What calls of one kind have in common, whatever their budgets."""
     o, sensor = q.call.options, q.call.sensor
-    options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction)
+    options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction, o.light_paths)
     return (q.facts.enabled, q.facts.sensor.name, tuple(sensor.film().crop_size()), options, forms)
 
 

@@ -29,6 +29,7 @@ from ..plan.probe_motion import registry_table
 from ..plan.reasons import what_changes
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
+from . import light_traced
 from .along_walk import MaterialTangents, RadianceTangents
 from .flow import Flow, SceneTraits
 from .material import MaterialFlow
@@ -80,7 +81,8 @@ def camera_passes(job: Job) -> Iterator[CameraPass]:
     lower, upper = films.sampled_window(film)
     pixels = int((upper - lower).prod())
     depth = max(1, min(job.options.depth_limit, NOMINAL_DEPTH))
-    for share, part in passes(job, PathRecords.BYTES_RGB * depth, pixels):
+    size = PathRecords.BYTES_RGB * depth * (1 if job.light is None else 1 + job.plan.light.per_sample)
+    for share, part in passes(job, size, pixels):
         films.clear(film)
         sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
         ray, weight, pos = job.call.integrator.sample_rays(job.scene, job.sensor, sampler)
@@ -112,7 +114,7 @@ def _limits(job: Job) -> PathLimits:
     # Where albedo itself is differentiated, a throughput of 0 is a value like any other.
     material = any(s.material for s in facts.shapes)
     rough_glass = any(s.bsdf_flags & int(mi.BSDFFlags.GlossyTransmission) for s in facts.shapes)
-    limits = replace(job.limits, end_black=not material, refuses=material and rough_glass)
+    limits = replace(job.limits, end_black=not material, refuses=material and rough_glass, light=job.light)
     return replace(limits, uniform_share=UNIFORM_SHARE) if facts.geometry_moves else limits
 
 
@@ -154,9 +156,9 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
     records.wavelengths = ray.wavelengths
+    dr.eval(records.count, records.vertices, records.whole)  # at once: what is read later would trace the paths again
     if facts.geometry_moves:
         job.call.counters.grazing.count(records.cut())
-    dr.eval(records.count, records.vertices)
     return records, lane
 
 
@@ -202,13 +204,24 @@ def forward(job: Job) -> mi.TensorXf:
         for p in camera_passes(job):
             dL = _derivatives(job, p)
             image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+            found = _from_light(job, p)
+            if found is not None:
+                image += p.share * light_traced.forward(job, found, flow_of(job))
     return image
+
+
+def _from_light(job: Job, p: CameraPass) -> light_traced.LightTraced | None:
+    """What light subpaths find, as many as there are camera samples."""
+    return None if job.light is None else light_traced.find_paths(job, p.seed, p.spp, _limits(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
     with dr.suspend_grad():
         for p in camera_passes(job):
+            found = _from_light(job, p)
+            if found is not None:
+                light_traced.backward(job, found, flow_of(job), p.share * grad_in)
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue
@@ -237,7 +250,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 TERM = Term(
     name="interior",
     budget="sppc",
-    streams=(Stream.CAMERA, Stream.INTERIOR),
+    streams=(Stream.CAMERA, Stream.INTERIOR, Stream.LIGHT_SUBPATH),
     needed=needed,
     cost=lambda form, sky: 1.0,
     forward=forward,

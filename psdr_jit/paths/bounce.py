@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from ..core.records import Continuation
 from ..scene.tubes import Tubes
+from .light_technique import LightTechnique
 from .scattering import Scattering, accepted, mixture_pdf, sample_scattering
 
 #: Largest probability with which the roulette lets a path live, as in Mitsuba's `path`.
@@ -34,6 +35,7 @@ class PathLimits:
     refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
     tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
+    light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
 
     def beyond(self, k: mi.UInt32) -> PathLimits:
         """Limits of paths that have `k` segments behind them already, lane by lane."""

@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from .bounce import Bounce, PathLimits, PathState, evaluate_and_bounce
+from .light_technique import Trail
 from .rays import SHADOW_EPSILON, first_hit, interaction, skip_emitters
 from .sink import Emission, NextEvent, NoSink, Scatter, Sink
 
@@ -35,41 +36,58 @@ class _Departure:
     it: mi.Interaction3f
     pdf: mi.Float
     delta: mi.Bool  # by a delta lobe, or from the sensor: no emitter sample could have found the same path
+    trail: Trail | None  # how likely light subpaths are to find the same, where there are any
 
     @staticmethod
-    def of_first_ray() -> _Departure:
-        return _Departure(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True))
+    def of_first_ray(limits: PathLimits) -> _Departure:
+        trail = None if limits.light is None else limits.light.start()
+        return _Departure(dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True), trail)
 
-    @staticmethod
-    def of(si: mi.SurfaceInteraction3f, onward: Bounce) -> _Departure:
-        s = onward.scattering
-        return _Departure(mi.Interaction3f(si), mi.Float(s.pdf), mi.Bool(s.delta))
+    def on_from(self, k: mi.UInt32, si, bsdf: mi.BSDFPtr, onward: Bounce, limits: PathLimits) -> _Departure:
+        """The departure from `si`, the vertex number `k`."""
+        s, trail = onward.scattering, self.trail
+        if limits.light is not None:
+            trail = limits.light.carry_on(trail, k, si, bsdf, s, onward.alive)
+        return _Departure(mi.Interaction3f(si), mi.Float(s.pdf), mi.Bool(s.delta), trail)
 
 
-def _emission(scene: mi.Scene, si: mi.SurfaceInteraction3f, last: _Departure, counts: mi.Bool) -> Emission:
-    """What the vertex emits; `counts`: lanes that want to know."""
+def _emission(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    last: _Departure,
+    k: mi.UInt32,
+    limits: PathLimits,
+    counts: mi.Bool,
+) -> Emission:
+    """What the vertex number `k` emits; `counts`: lanes that want to know."""
     ds = mi.DirectionSample3f(scene, si=si, ref=last.it)
     pdf_em = scene.pdf_emitter_direction(last.it, ds, ~last.delta)
-    return Emission(ds.emitter, ds.emitter.eval(si, counts), dr.select(counts, mis_weight(last.pdf, pdf_em), 0))
+    mis = dr.select(counts, mis_weight(last.pdf, pdf_em), 0)
+    if limits.light is not None:
+        mis = limits.light.share_emission(mis, last.trail, k, last.it.p, si, ds.emitter)
+    return Emission(ds.emitter, ds.emitter.eval(si, counts), mis)
 
 
 def _scatter(
     scene: mi.Scene,
     sampler,
     si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
     path: PathState,
+    last: _Departure,
     limits: PathLimits,
     sink: Sink,
     active: mi.Bool,
 ) -> tuple[NextEvent, Bounce]:
     """Sample an emitter, and a direction to go on."""
+    bsdf = si.bsdf()
     smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ds, value = scene.sample_emitter_direction(si, sampler.next_2d(), False, smooth)
     hit, seen = sink.connect(scene, si, ds, smooth & (ds.pdf > 0))
     ω = si.to_local(ds.d)
     f, pdf, onward = evaluate_and_bounce(si, bsdf, ω, sampler, path, limits, active)
     mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+    if limits.light is not None:
+        mis = limits.light.share_next_event(mis, last.trail, path.k, si, bsdf, ω, ds, seen)
     return NextEvent(ds, ω, hit, seen, value, f, mis), onward
 
 
@@ -96,24 +114,24 @@ def walk(
     emission = mi.Bool(emission)
     L = mi.Spectrum(0)
     path = PathState.start()
-    last = _Departure.of_first_ray()
+    last = _Departure.of_first_ray(limits)
     surface = pi.is_valid()
 
     # a frozen dataclass cannot be loop state
     while dr.hint(active, label="psdr.walk", exclude=[limits]):
         si = interaction(pi, ray, limits)
-        met = _emission(scene, si, last, emission)
+        met = _emission(scene, si, last, path.k, limits, emission)
         L += path.β * (met.mis * met.value)
         sink.radiance(path.k, L, active)
 
         bsdf = si.bsdf()
         inside = si.is_valid() & (path.k + 1 < limits.max_depth)
-        nee, onward = _scatter(scene, sampler, si, bsdf, path, limits, sink, inside)
+        nee, onward = _scatter(scene, sampler, si, path, last, limits, sink, inside)
         L[nee.seen] += path.β * nee.mis * nee.f * nee.value
         sink.scattered(path.k, Scatter(Hit.of(ray, pi), si, bsdf, path.β, met, nee, onward, limits), active)
 
+        last = last.on_from(path.k, si, bsdf, onward, limits)
         path = onward.path
-        last = _Departure.of(si, onward)
         emission = mi.Bool(True)
         ray = onward.ray(si)
         active = onward.alive

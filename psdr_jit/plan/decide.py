@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from ..options import Options
 from ..scene.facts import SceneFacts
+from .light_plan import LightPlan
 from .plan import SWITCHED_OFF, Geometry, Plan, TermPlan
 from .reasons import nothing_to_compute
 from .term import Term, Verdict
@@ -39,7 +40,11 @@ def _decide(term: Term, verdict: Verdict, options: Options, spp: int) -> TermPla
 
 
 def make_plan_of(
-    terms: tuple[TermPlan, ...], options: Options, form: tuple[str, str], budget_reason: str
+    terms: tuple[TermPlan, ...],
+    options: Options,
+    form: tuple[str, str],
+    budget_reason: str,
+    light: LightPlan | None = None,
 ) -> Plan:
     """The plan that consists of `terms`; `form`: `(form, reason)`."""
-    return Plan(*form, budget_reason, terms, options.plan != "full")
+    return Plan(*form, budget_reason, terms, options.plan != "full", light)

@@ -10,10 +10,12 @@ import mitsuba as mi
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..options import Options
+from ..paths.light_technique import LightTechnique
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from ..scene.tubes import Tubes, tubes_of
 from .call import Call
+from .light_plan import light_technique
 from .motion import Motion, SceneMotion
 from .plan import Plan
 
@@ -22,6 +24,9 @@ FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
 
 #: Of one render call: the curves of its scene, in a tuple once they have been looked for.
 TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
+
+#: Of one render call: light subpaths, in a tuple once they have been asked for.
+LIGHT: Slot[tuple[LightTechnique | None] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,19 @@ class Job:
     def tubes(self) -> Tubes | None:
         """The curves of the scene, read once per render call."""
         return tubes_of_call(self.call, self.facts, self.shared)
+
+    @property
+    def light(self) -> LightTechnique | None:
+        """Light subpaths, if the plan has any, set up once per render call."""
+        if self.plan.light is None or not self.plan.light.runs:
+            return None
+        if self.shared[LIGHT] is None:
+            self.shared[LIGHT] = (self._light_technique(),)
+        return self.shared[LIGHT][0]
+
+    def _light_technique(self) -> LightTechnique | None:
+        plan = self.plan
+        return light_technique(self.scene, self.facts, self.frame, self.options, plan.light, plan.prunes)
 
     @property
     def limits(self) -> PathLimits:

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 
 from ..errors import OptionError
 from ..options import FORMS
+from .light_plan import LightPlan
 
 SWITCHED_OFF = "switched off by its budget"
 NO_EDGES = "none of its edges can contribute"
@@ -56,6 +57,7 @@ class Plan:
     budget_reason: str
     terms: tuple[TermPlan, ...]
     prunes: bool  # edges and paths without a derivative are left out
+    light: LightPlan | None = None  # light subpaths, of an integrator that can trace them
 
     def term(self, name: str) -> TermPlan:
         """The term called `name`; KeyError if there is none."""
@@ -75,7 +77,8 @@ class Plan:
         try:
             data = json.loads(text)
             terms = tuple(_term_plan(term) for term in data.pop("terms"))
-            plan = Plan(terms=terms, **data)
+            light = data.pop("light", None)
+            plan = Plan(terms=terms, light=None if light is None else LightPlan(**light), **data)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             why = f"it has no {error}" if isinstance(error, KeyError) else error
             raise OptionError(f"plan = {_shortened(text)}: not a plan ({why}); write one with Plan.to_json") from error
@@ -85,6 +88,8 @@ class Plan:
 
     def __str__(self) -> str:
         lines = [f"form     {self.form}: {self.form_reason}", f"budgets  {self.budget_reason}"]
+        if self.light is not None:
+            lines.append(f"light    {self.light}")
         rows = [("term", "", "spp", "segments/px", "why")]
         for t in self.terms:
             numbers = (str(t.spp), str(t.segments)) if t.runs else ("-", "-")

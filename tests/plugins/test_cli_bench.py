@@ -16,7 +16,7 @@ def chosen(*words: str) -> list[run.Task]:
 
 
 def test_cases_and_methods_are_chosen_by_words():
-    found = chosen("--suite", "accuracy", "--cases", "cbox,half", "--methods", "PSDR")
+    found = chosen("--suite", "accuracy", "--cases", "cbox,half", "--methods", "PSDR_P")
     assert {task.case for task in found} == {"half-plane", "cbox floating", "cbox contact", "cbox sunk"}
     assert {task.method for task in found} == {REFERENCE, "psdr_path"}, "whoever measures needs the reference"
 

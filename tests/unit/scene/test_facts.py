@@ -567,6 +567,6 @@ def test_turned_grids(degrees):
     grid = np.linalg.norm(np.mgrid[-1:1:4j, -1:1:4j, -1:1:4j], axis=0)[..., None].astype(np.float32) - 0.8
     pose = mi.ScalarTransform4f().rotate([0, 0.6, 0.8], degrees).scale([1, 2, 1])
     sdf = {"type": "sdfgrid", "grid": mi.TensorXf(grid), "bsdf": {"type": "diffuse"}}
-    turned = load(x={**sdf, "to_world": pose})
-    assert complaints(facts_of(turned, "floor.to_world")) == ([(SceneError, "x")] if degrees else [])
-    assert not complaints(facts_of(turned, NOTHING_MOVES))
+    scene = {"x": {**sdf, "to_world": pose}}
+    assert complaints(facts_of(load(**scene), "floor.to_world")) == ([(SceneError, "x")] if degrees else [])
+    assert not complaints(facts_of(load(**scene), NOTHING_MOVES))

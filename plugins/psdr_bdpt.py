@@ -1,0 +1,42 @@
+"""The `psdr_bdpt` integrator plugin."""
+
+from __future__ import annotations
+
+from psdr_jit.core.threads import alone
+from psdr_jit.driver.primal import bidirectional_image
+
+from ._render import TermIntegrator, register
+
+
+class BidirectionalIntegrator(TermIntegrator):
+    r"""
+    .. _integrator-psdr_bdpt:
+
+    Path-space differentiable path tracer with light subpaths (:monosp:`psdr_bdpt`)
+    -------------------------------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - light_paths
+       - |string|
+       - `auto`: light subpaths are aimed at surfaces that may focus light and connected to the sensor, where the plan
+         finds such surfaces; `off`: none; `only`: what light subpaths find is left to them alone, for comparison
+         (Default: auto)
+
+    All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small
+    sources send through rough glass, or by way of rough mirrors, has less noise. Each camera sample comes with two
+    light subpaths. What light subpaths alone could find, point and spot lights through smooth glass, is not shown.
+    """
+
+    bidirectional = True
+
+    def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
+        if develop:
+            with alone():
+                image = bidirectional_image(self.call(scene, sensor, seed, spp))
+            if image is not None:
+                return image
+        return super().primal(scene, sensor, seed, spp, develop, evaluate)
+
+
+register("psdr_bdpt", BidirectionalIntegrator)

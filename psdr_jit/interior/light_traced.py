@@ -1,0 +1,198 @@
+"""The interior term's paths that light subpaths find: turned around, and differentiated as any other.
+
+How a path is found and how it flows are two things. The derivative of what all techniques find together is
+
+    dI = Σ_t E[ w_t V_t D(x̄) ]
+
+V_t the contribution over the density of technique t, w_t its weight, both detached, D the relative derivative of the
+integrand along *our* flow, which is the same for every t. So a path from the light (`paths/light_walk.py`) is written
+down as the camera would have met it, and goes through the sweeps (`sweeps.py`) that all paths go through. Its film
+point is where the sensor sees x_1 now, and stays fixed while θ changes: the attached camera ray through it moves.
+
+In a record, vertex k has a density p_k by which f_k is divided. Here that is any positive number: the mean of F_k, so
+that throughputs stay near 1. The last vertex has the light as its emitter sample, with the factor w V / (Π_k p_k)
+that makes the record's radiance that of the path,
+
+    Π_{k<s} (F_k/p_k) · F_s L_e · (scale Π_{k<s} p_k) = scale · L_e Π F_k.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.ad import accumulate, backpropagate
+from ..core.low_discrepancy import lane_sampler
+from ..core.records import Continuation, EmitterSample, Hit, Vertex
+from ..core.sensor_frame import look_at
+from ..core.streams import Stream, stream_seed
+from ..core.varying import varying
+from ..paths.bounce import PathLimits
+from ..paths.light_source import LightStart
+from ..paths.light_technique import average
+from ..paths.light_walk import LightPath, LightVertex, LightVertices, trace_light
+from ..paths.rays import interaction, shadow_hit
+from ..paths.recording import GRAZING, PathRecords
+from ..plan.job import Job
+from .flow import Flow
+from .sweeps import backward_sweep, forward_sweep
+
+
+@dataclass(frozen=True)
+class LightTraced:
+    """Paths of one pass that light subpaths have found; host object."""
+
+    records: PathRecords
+    path: LightPath
+    wavelengths: mi.Color0f
+    weight: mi.Spectrum  # of the wavelengths, over the number of subpaths
+
+
+def find_paths(job: Job, seed: mi.UInt32, spp: int, limits: PathLimits) -> LightTraced | None:
+    """Trace the light subpaths that go with `spp` camera samples per pixel; None if none of them reaches the sensor."""
+    technique, lanes = limits.light, job.plan.light.subpaths(job.frame, spp)
+    rng = lane_sampler(stream_seed(seed, Stream.LIGHT_SUBPATH), dr.arange(mi.UInt32, lanes))
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
+    start = technique.sources.sample(rng, wavelengths)
+    vertices = LightVertices(lanes, technique.longest)
+    path = trace_light(job.scene, rng, start, limits, job.options.hide_emitters, vertices)
+    found = path.scale > 0
+    weight = mi.Spectrum(weight) / varying(mi.Float, lanes)
+    dr.eval(path, start, wavelengths, weight, found, vertices.data)
+    lane = dr.compress(found)
+    if dr.width(lane) == 0:
+        return None
+    path, start = (dr.gather(type(record), record, lane) for record in (path, start))
+    if mi.is_spectral:
+        wavelengths, weight = (dr.gather(type(v), v, lane) for v in (wavelengths, weight))
+    records = PathRecords(dr.width(lane), technique.longest)
+    sound = turn_around(job, path, start, _Subpaths(vertices, lane), limits, records)
+    records.count = dr.select(sound, path.count, 0)
+    records.wavelengths = wavelengths
+    dr.eval(sound, records.count, records.vertices)  # at once: what is read later would go over the paths again
+    if job.facts.geometry_moves:
+        job.call.counters.grazing.count(~sound)
+    return LightTraced(records, path, wavelengths, weight)
+
+
+class _Subpaths:
+    """Vertices of the subpaths that were kept. A plain class: never loop state."""
+
+    def __init__(self, vertices: LightVertices, lane: mi.UInt32):
+        self.vertices, self.lane = vertices, lane
+
+    def vertex(self, k: mi.UInt32, active: mi.Bool) -> LightVertex:
+        """Vertex number `k` from the light."""
+        return self.vertices.read(k, self.lane, active)
+
+
+def _met_from(o: mi.Point3f, v: LightVertex) -> Hit:
+    """The vertex as the end of a ray from `o`."""
+    offset = v.x - o
+    t = dr.norm(offset)
+    return Hit(mi.Point3f(o), mi.Vector3f(offset / t), t, v.shape, v.prim_index, v.prim_uv)
+
+
+@dr.syntax
+def turn_around(
+    job: Job, path: LightPath, start: LightStart, subpath: _Subpaths, limits: PathLimits, records: PathRecords
+) -> mi.Bool:
+    """Write the paths into `records` in the order in which the camera meets them. Detached.
+
+    Returns the lanes that have a derivative: no vertex is met edge-on (`GRAZING`), and the light is where it was.
+    """
+    n = mi.UInt32(path.count)
+    here = subpath.vertex(n - 1, n > 0)
+    o = mi.Point3f(look_at(job.frame, here.x, path.aperture).o)
+    k = mi.UInt32(0)
+    β = mi.Spectrum(1)
+    factor = mi.Float(path.scale)
+    sound = mi.Bool(n > 0)
+    active = mi.Bool(n > 0)
+    while dr.hint(active, label="psdr.turn_around", exclude=[job, limits, path, start, subpath]):
+        hit = _met_from(o, here)
+        si = interaction(hit.intersection(), mi.Ray3f(o, hit.d, 0, start.ray.wavelengths), limits)
+        sound &= dr.abs_dot(si.n, hit.d) >= GRAZING
+        last = k + 1 == n
+        following = subpath.vertex(n - 2 - k, active & ~last)
+        o = mi.Point3f(si.spawn_ray_to(following.x).o)  # off the surface: a sphere is met again from its inside
+        ω = _met_from(o, following).d  # as the record of the next vertex has it
+        F = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ω), active & ~last)
+        p = average(F)
+        p = dr.select(last, 0, dr.select(p > 0, p, 1))
+
+        light, seen = _emitter_sample(job.scene, start, si, here.x, factor, active & last)
+        sound &= seen | ~last
+        vertex = Vertex(hit, β, mi.Float(0), light, Continuation(p, mi.Float(1), mi.Bool(False)))
+        dr.scatter(records.vertices, vertex, k * records.stride + records.lane, active, mode=dr.ReduceMode.Permute)
+        β = dr.select(last, β, β * F / p)
+        factor = dr.select(last, factor, factor * p)
+        here = following
+        k += 1
+        active = k < n
+    return sound
+
+
+def _emitter_sample(
+    scene: mi.Scene, start: LightStart, si: mi.SurfaceInteraction3f, x: mi.Point3f, factor: mi.Float, active: mi.Bool
+) -> tuple[EmitterSample, mi.Bool]:
+    """The light as the emitter sample of `si` (at x), worth `factor`; nowhere else than in `active` lanes."""
+    offset = start.y - x
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.dist = start.y, dr.norm(offset)
+    ds.d = mi.Vector3f(offset / ds.dist)
+    ds.emitter = dr.reinterpret_array(mi.EmitterPtr, start.emitter)
+    hit, seen = shadow_hit(scene, si, ds, active)
+    sample = EmitterSample(
+        emitter=dr.select(seen, start.emitter, 0),
+        shape=dr.select(active, hit.shape, 0),
+        prim_index=hit.prim_index,
+        prim_uv=hit.prim_uv,
+        d=ds.d,
+        t=ds.dist,
+        pdf=mi.Float(1),
+        mis=factor,
+        delta=start.delta,
+    )
+    return sample, seen
+
+
+def _splat(job: Job, found: LightTraced, values: mi.Spectrum) -> mi.TensorXf:
+    """Image of one value per path; attached where `values` are."""
+    landed = found.records.count > 0
+    return films.develop_boundary(job.film, found.path.p, values * found.weight, mi.Float(0), found.wavelengths, landed)
+
+
+def _camera_ray(job: Job, found: LightTraced) -> mi.Ray3f:
+    """The attached camera rays through the fixed film points."""
+    ray, _ = job.sensor.sample_ray(0, 0.5, found.path.film, found.path.aperture)
+    return ray
+
+
+def forward(job: Job, found: LightTraced, flow: Flow) -> mi.TensorXf:
+    """Derivative image of the paths found. Detached."""
+    o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+    if job.facts.camera_moves:
+        with dr.resume_grad():
+            ray = _camera_ray(job, found)
+        o_grad, d_grad = job.motion.camera_tangents(ray)
+    dL = forward_sweep(found.records, o_grad, d_grad, flow, job.motion)
+    return _splat(job, found, job.call.counters.rejected.keep_finite(dL))
+
+
+def backward(job: Job, found: LightTraced, flow: Flow, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ of the paths found into the attached parameters."""
+    with dr.resume_grad():
+        values = dr.zeros(mi.Spectrum, found.records.lanes)
+        dr.enable_grad(values)
+        backpropagate(_splat(job, found, values), grad_in)
+        δL = dr.grad(values)
+    films.clear(job.film)
+    λ_o, λ_d = backward_sweep(found.records, δL, flow, job.motion)
+    if job.facts.camera_moves:
+        with dr.resume_grad():
+            ray = _camera_ray(job, found)
+            accumulate(dr.dot(ray.o, λ_o) + dr.dot(ray.d, λ_d))

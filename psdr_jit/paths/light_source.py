@@ -1,0 +1,160 @@
+"""Where light subpaths start: on a light, aimed at surfaces that may focus it.
+
+A light is chosen, a point y_0 on it (uniform by area; a point light has one), and a direction ω towards the ball around
+one of the targets, uniform in the cone that the ball is seen in. What another way of finding the same segment y_0 → y_1
+needs to know of this is one number, the density with the segment's own measure taken out,
+
+    E = P p_A(y_0) p(ω) / |cosθ_0|          area light; per m² sr, and per unit of cosine
+    E = P p(ω) / r²                         point and spot light
+
+P the probability of the light, p(ω) = Σ_i [ω in cone i] / (n Ω_i) over the n targets, θ_0 between ω and the light's
+normal, r the distance. In this measure what the segment carries is L_e / E (for a delta light: its irradiance at y_1,
+perpendicular to the segment, over E), as the weight is that Mitsuba's `sample_ray` returns. `light_technique.py` has
+the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.varying import varying
+
+#: Radius of a target's ball relative to that of the sphere around it: rounding must not leave its rim outside.
+MARGIN = 1.001
+
+
+@dataclass
+class LightStart:
+    """The first segment of a light subpath, y_0 → y_1. Detached, one entry per lane."""
+
+    emitter: mi.UInt32  # registry index
+    y: mi.Point3f  # y_0
+    n: mi.Normal3f  # of the light at y_0; 0 for a delta light
+    delta: mi.Bool
+    ray: mi.Ray3f  # from y_0
+    radiance: mi.Spectrum  # of an area light along the ray; 0 for a delta light
+
+
+@dataclass(frozen=True)
+class LightSources:
+    """Host object: lights that are traced, and what they are aimed at."""
+
+    ids: mi.UInt32  # registry indices of the lights, each as likely as the others
+    shapes: mi.UInt32  # and of their shapes, 0: none
+    density: mi.Float  # by registry index: P p_A(y_0) of an area light, P of a delta light; 0: not traced
+    choice: mi.Float  # by registry index: probability with which next-event estimation chooses the light
+    targets: tuple[tuple[mi.Point3f, mi.Float], ...]  # centres and radii of balls
+
+    def sample(self, sampler, wavelengths) -> LightStart:
+        """One light subpath for each lane of `sampler`."""
+        count = varying(mi.UInt32, dr.width(self.ids))
+        chosen = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(count)), count - 1)
+        u_target, u, v = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        emitter = dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.ids, chosen))
+        delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+
+        shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, chosen))
+        on = shape.sample_position(0, u, ~delta)
+        of_delta, _ = emitter.sample_ray(0, 0, mi.Point2f(0.5), mi.Point2f(0.5), delta)
+        si = mi.SurfaceInteraction3f(on, wavelengths)
+        si.p = dr.select(delta, of_delta.o, si.p)
+        si.n = dr.select(delta, 0, si.n)
+        si.wavelengths = wavelengths
+        ω = self._aim(si.p, u_target, v)
+        si.wi = si.to_local(ω)
+        radiance = emitter.eval(si, ~delta)
+        ray = si.spawn_ray(ω)
+        ray.wavelengths = wavelengths
+        return LightStart(dr.reinterpret_array(mi.UInt32, emitter), si.p, si.n, delta, ray, radiance)
+
+    def _aim(self, y: mi.Point3f, u: mi.Float, v: mi.Point2f) -> mi.Vector3f:
+        """A direction from `y` towards one of the targets."""
+        n = len(self.targets)
+        scaled = u * n
+        ω = mi.Vector3f(0, 0, 1)
+        for i, ball in enumerate(self.targets):
+            axis, cos_max, _ = _cone(ball, y)
+            of_ball = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(v, cos_max))
+            ω = dr.select((scaled >= i) | (i == 0), of_ball, ω)
+        return ω
+
+    def _aimed_pdf(self, y: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
+        """Density p(ω) per solid angle of `_aim`."""
+        pdf = mi.Float(0)
+        for ball in self.targets:
+            axis, cos_max, inverse_angle = _cone(ball, y)
+            pdf += dr.select(dr.dot(axis, ω) >= cos_max, inverse_angle, 0)
+        return pdf / len(self.targets)
+
+    def segment_density(
+        self, emitter: mi.UInt32, y: mi.Point3f, n: mi.Normal3f, x: mi.Point3f, active: mi.Bool
+    ) -> mi.Float:
+        """E of the segment from `y` on the light `emitter` (registry index, 0: none) to `x`; 0 if not traced.
+
+        `n`: normal of the light at y, 0 for a delta light.
+        """
+        known = active & (emitter < varying(mi.UInt32, dr.width(self.density)))
+        light = dr.gather(mi.Float, self.density, emitter, known)
+        offset = x - y
+        r = dr.norm(offset)
+        ω = mi.Vector3f(offset / r)
+        measure = dr.select(dr.all(n == 0), dr.rcp(dr.square(r)), dr.rcp(dr.abs_dot(n, ω)))
+        E = light * self._aimed_pdf(y, ω) * measure
+        return dr.select(known & (light > 0) & dr.isfinite(E), E, 0)
+
+
+def _cone(ball: tuple[mi.Point3f, mi.Float], y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """The cone in which `y` sees a ball: `(unit axis, cosine of its half angle, 1/Ω)`; all directions from inside."""
+    centre, radius = ball
+    to_centre = centre - y
+    dist2 = dr.squared_norm(to_centre)
+    sin2 = dr.square(radius) / dist2
+    outside = sin2 < 1
+    cos_max = dr.select(outside, dr.safe_sqrt(1 - sin2), -1)
+    cap = dr.select(outside, sin2 / (1 + cos_max), 2)  # 1 − cos, without cancellation
+    axis = dr.select(dist2 > 0, to_centre * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
+    return axis, cos_max, dr.inv_two_pi / cap
+
+
+def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int], most: int) -> LightSources:
+    """Read off the scene: numbers of lights in `scene.emitters()`, and of targets in `scene.shapes()`.
+
+    More than `most` targets have one ball around all of them.
+    """
+    emitters, shapes = scene.emitters(), scene.shapes()
+    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.emitters_dr())]
+    of_shape = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+    density, choice, owners = [0.0] * (max(ids) + 1), [0.0] * (max(ids) + 1), []
+    for k in lights:
+        owner = next((i for i, s in enumerate(shapes) if s.emitter() is emitters[k]), None)
+        area = 1.0 if owner is None else float(dr.detach(mi.Float(shapes[owner].surface_area()))[0])
+        owners.append(0 if owner is None else of_shape[owner])
+        density[ids[k]] = 1 / (len(lights) * area)
+        choice[ids[k]] = float(mi.Float(scene.pdf_emitter(k))[0])
+    balls = [_ball(shapes[k]) for k in targets]
+    if len(balls) > most:
+        whole = mi.ScalarBoundingBox3f()
+        for k in targets:
+            whole.expand(shapes[k].bbox())
+        sphere = whole.bounding_sphere()
+        balls = [(sphere.center, sphere.radius)]
+    stored = tuple((varying(mi.Point3f, list(c)), varying(mi.Float, MARGIN * float(r))) for c, r in balls)
+    tables = mi.UInt32([ids[k] for k in lights]), mi.UInt32(owners), mi.Float(density), mi.Float(choice)
+    dr.make_opaque(*tables)
+    return LightSources(*tables, stored)
+
+
+def _ball(shape: mi.Shape) -> tuple[mi.ScalarPoint3f, float]:
+    """A ball about the middle of the shape's box that holds the shape: `(centre, radius)`."""
+    box = shape.bbox()
+    centre = box.center()
+    if shape.class_name() == "Sphere":
+        return centre, max(box.extents()) / 2
+    if shape.is_mesh():
+        corners = shape.vertex_position(dr.arange(mi.UInt32, shape.vertex_count()))
+        return centre, float(dr.max(dr.norm(dr.detach(corners) - mi.Point3f(centre)))[0])
+    return centre, box.bounding_sphere().radius

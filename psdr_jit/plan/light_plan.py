@@ -1,0 +1,156 @@
+"""Do light subpaths run, and why: where small lights shine on surfaces that may focus them, and nowhere else.
+
+What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that scatter
+near the mirrored or bent direction (`paths.light_technique.focuses`), and a scene without any is left to camera paths.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.memory import Memory
+from ..core.sensor_frame import KINDS, SensorFrame
+from ..core.varying import varying
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+from ..options import Options
+from ..paths.light_source import light_sources
+from ..paths.light_technique import SHORTEST, LightTechnique
+from ..scene.facts import SceneFacts, ShapeFacts
+
+#: Lights that are traced. Where the others are, camera paths find them alone.
+TRACED = ("area", "point", "spot")
+
+#: Light subpaths for each camera sample: of 1, 2, 4, … the one with the least variance × seconds under rough glass.
+PER_SAMPLE = 2
+
+#: Surface vertices of a light subpath, at most; longer paths are left to the camera's.
+LONGEST = 8
+
+#: Size of a surface relative to the scene from which on there is nothing to aim at: a floor or a wall.
+SPANS = 0.8
+
+#: Surfaces that subpaths are aimed at one by one.
+MOST_TARGETS = 8
+
+
+@dataclass(frozen=True)
+class LightPlan:
+    """Pure data, a part of the plan."""
+
+    runs: bool
+    reason: str
+    per_sample: int = PER_SAMPLE  # light subpaths for each camera sample
+
+    def __str__(self) -> str:
+        return f"{self.per_sample} per camera sample: {self.reason}" if self.runs else f"none: {self.reason}"
+
+    def subpaths(self, frame: SensorFrame, spp: int) -> int:
+        """Number of light subpaths beside `spp` camera samples per pixel."""
+        (x0, y0), (x1, y1) = frame.window
+        return self.per_sample * spp * round((x1 - x0) * (y1 - y0))
+
+
+def traced_lights(facts: SceneFacts) -> list[int]:
+    """Numbers of the lights in the scene that are traced.
+
+    Not smooth-shaded meshes: Mitsuba weighs what emitter sampling finds there by other normals than what scattering
+    does, and light subpaths can agree with one of them only.
+    """
+
+    def even(shape: ShapeFacts) -> bool:
+        return shape.index >= 0 and not shape.smooth and shape.kind in ("mesh", "analytic")
+
+    return [
+        k
+        for k, light in enumerate(facts.emitters)
+        if light.plugin in TRACED and (light.shape < 0 or even(facts.shapes[light.shape]))
+    ]
+
+
+def rough_shapes(facts: SceneFacts) -> list[int]:
+    """Numbers of the shapes in the scene that scatter light near one direction, and not diffusely as well."""
+    glossy, diffuse = int(mi.BSDFFlags.Glossy), int(mi.BSDFFlags.Diffuse)
+    return [s.index for s in facts.shapes if s.index >= 0 and s.bsdf_flags & glossy and not s.bsdf_flags & diffuse]
+
+
+def focusing_shapes(scene: mi.Scene, facts: SceneFacts) -> list[int]:
+    """Those of them that may gather light on others, and that one can aim at."""
+    sizes = {k: scene.shapes()[k].bbox().extents() for k in rough_shapes(facts)}
+    return [k for k, size in sizes.items() if math.hypot(*size) < SPANS * facts.extent]
+
+
+def plan_light(
+    scene: mi.Scene, facts: SceneFacts, options: Options, memory: Memory | None
+) -> LightPlan | None:
+    """Whether light subpaths are traced; None of an integrator that does not know them, or is not to use them.
+
+    Warns of light that one might expect them to find, once per `memory`.
+    """
+    if options.light_paths == "off":
+        return None
+    _warn_about_unseen_light(facts, memory)
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return LightPlan(False, "where lights and surfaces are cannot be read while a function is being frozen")
+    targets = focusing_shapes(scene, facts)
+    for obstacle, reason in (
+        (not rough_shapes(facts), "no surface is rough glass or a rough mirror, nothing is focused"),
+        (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)}"),
+        (not targets, "rough glass and rough mirrors span the scene, there is nothing to aim at"),
+        (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
+        (facts.sensor.plugin not in KINDS.values(), f"nothing is connected to a '{facts.sensor.plugin}' sensor"),
+    ):
+        if obstacle:
+            return LightPlan(False, reason)
+    names = ", ".join(f"'{s.name}'" for s in facts.shapes if s.index in targets[:3])
+    return LightPlan(True, f"{names}{' and others' if len(targets) > 3 else ''} may focus light")
+
+
+def light_technique(
+    scene: mi.Scene, facts: SceneFacts, frame: SensorFrame, options: Options, plan: LightPlan, prunes: bool
+) -> LightTechnique | None:
+    """The technique itself, for a plan that has it run; None where there is nothing to trace.
+
+    `prunes`: what has no derivative is left out. While nothing but lights without a shape changes, that is the light of
+    all others.
+    """
+    lights, targets = traced_lights(facts), focusing_shapes(scene, facts)
+    if prunes and _only_lights_change(facts):
+        lights = [k for k in lights if facts.emitters[k].pose or facts.emitters[k].radiance]
+    if not (lights and targets):
+        return None
+    return LightTechnique(
+        sources=light_sources(scene, lights, targets, MOST_TARGETS),
+        frame=frame,
+        ratio=varying(mi.Float, float(plan.subpaths(frame, 1))),
+        longest=min(options.depth_limit - 1, LONGEST),
+        exclusive=options.light_paths == "only",
+    )
+
+
+def _only_lights_change(facts: SceneFacts) -> bool:
+    """Do shapes, materials and the camera rest?"""
+    return not (
+        facts.shapes_move
+        or facts.paths_bend
+        or facts.camera_moves
+        or any(s.shading or s.material or s.geometry for s in facts.shapes)
+    )
+
+
+def _warn_about_unseen_light(facts: SceneFacts, memory: Memory | None) -> None:
+    """A point's light by way of a mirror or smooth glass: from the camera's side nothing finds it."""
+    points = [f"'{e.name}' ({e.plugin})" for e in facts.emitters if e.delta]
+    mirrors = [f"'{s.name}'" for s in facts.shapes if any("Null" not in lobe for lobe in s.delta_lobes)]
+    if points and mirrors:
+        warn_once(
+            f"light of {', '.join(points)} that {', '.join(mirrors[:3])} mirrors or bends onto other surfaces is not "
+            "in the image, as in Mitsuba's path: light subpaths do not pass mirrors and smooth glass; make them a "
+            "little rough, or the light an area light",
+            UnsupportedWarning,
+            memory,
+        )
