@@ -122,7 +122,7 @@ SUPPORT = (
         "onto others: 1 to 5 % off; lights and mirrors with normals far off their faces: warning"),
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, SDF grids that are turned or have unequal numbers of values along "
-        "the axes: error"),
+        "the axes: error; smooth normals on fewer than 48 values a side: warning"),
     Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),

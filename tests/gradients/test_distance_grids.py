@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,6 +22,7 @@ from psdr_jit.edges.grid_triangles import grid_triangles
 from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.paths.grid_surface import grid_surface
 from psdr_jit.plan.motion import SceneMotion
+from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.facts import analyse
 from psdr_jit.scene.grids import blends_normals, moving_grids
 from psdr_jit.scene.tubes import tubes_of
@@ -161,3 +164,15 @@ def test_a_camera_passes(llvm, name):
     slope = gain(forward(motion, spec, 16, 1024), reference[0::2], reference[1::2])
     assert slope.stderr < 0.01, slope
     assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
+
+
+@pytest.mark.parametrize("normals", ["smooth", "analytic"])
+def test_coarse_grids_with_blended_normals_are_named(llvm, normals):
+    scene = scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=8, normals=normals)
+    motion = perturb(scene, "camera.to_world", (1, 0, 0))
+    integrator = mi.load_dict({"type": "psdr_path", "max_depth": 2})
+    motion.attach()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        integrator.render_forward(scene, motion.params, sensor=scene.sensors()[0], spp=1)
+    assert any("blended normals" in str(w.message) for w in found) == (normals == "smooth")
