@@ -94,6 +94,6 @@ def test_a_wrong_property_is_named_without_our_own_frames():
         mi.load_dict({"type": "psdr_path", "max_depth": "x"})
     lines = str(caught.value).splitlines()
     assert lines[-1].startswith("OptionError: max_depth = 'x' is of type str")
-    assert sum("psdr_path.py" in line for line in lines) == 1 and not any("options.py" in line for line in lines)
+    assert sum("_render.py" in line for line in lines) == 1 and not any("options.py" in line for line in lines)
     with pytest.raises(OptionError, match="integrator 'psdr_path' cannot be made: it has no property 'bogus'"):
         psdr_jit.gradient(load(), BOX, (1, 0, 0), integrator={"type": "psdr_path", "bogus": 1})
