@@ -197,8 +197,10 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         return []
     if job.options.depth_limit > 2 or any(not e.delta for e in job.facts.emitters):  # surfaces are lights as well
         limit = COARSE if job.scene.environment() is None else COARSE_UNDER_SKY
+        # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.
+        flips = job.facts.has_delta_emitters and job.options.depth_limit > 2
         missing = [shape for shape, s in zip(shapes, meshes, strict=True)
-                   if s.smooth and (s.is_emitter or s.delta_lobes)]  # fmt: skip
+                   if s.smooth and (s.is_emitter or s.delta_lobes or flips)]  # fmt: skip
         warn_about_coarse(missing, limit, job.call.memory)
     return [ShadingOutlines(faces, centre)]
 
