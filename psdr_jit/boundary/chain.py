@@ -280,7 +280,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 
 
 def cost(form: str, sky: bool) -> float:
-    """Time of a line relative to a path of the interior term (mirror, cube and ball of glass at 48², two cores)."""
+    """Time of a line relative to a path of the interior term: 2.5 in a Cornell box with a mirror and a glass ball, 8
+    with a ball of glass alone (64², two cores)."""
     return 6.0
 
 

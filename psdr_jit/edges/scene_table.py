@@ -27,7 +27,7 @@ from .buried import buried
 from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
-from .edge_shapes import edge_shapes
+from .edge_shapes import GridPlace, edge_shapes
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
@@ -52,6 +52,9 @@ TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
 
 #: Of an integrator: the arrays that straight edges were made from while every shape rests, and these edges.
 RESTING: Slot[tuple[list, EdgeSet] | None] = Slot(lambda: None)
+
+#: Values along an axis of a grid from which the band along outlines, in which blended normals turn away, is narrow.
+FINE = 48
 
 
 def scene_edges(job: Job) -> EdgeTable:
@@ -88,21 +91,29 @@ def edge_table(job: Job) -> EdgeTable:
     grids = scene_grids(job)
     if grids is not None:
         stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]
-        _warn_about_smooth_values(job, [place.facts for place, steps in zip(grids.places, stepped, strict=True)
-                                        if not steps])  # fmt: skip
+        _warn_about_blended(job, [place for place, steps in zip(grids.places, stepped, strict=True) if not steps])
         kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden)
 
 
-def _warn_about_smooth_values(job: Job, smooth: list[ShapeFacts]) -> None:
+def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:
     """Blended normals turn black within a cell of the outline; that step is counted at the outline."""
-    for facts in smooth:
-        if VALUES in facts.geometry:
-            message = (f"shape '{facts.name}' (sdfgrid, normals='smooth') is differentiated by its values: what turns "
-                       "black a fraction of a cell beside its outlines moves otherwise than these, and the derivative "
-                       "is 5 % off with 10 values along an axis; use normals='analytic', or more values")  # fmt: skip
+    for place in places:
+        values = mi.traverse(place.shape)[VALUES].shape[0]
+        messages = []
+        if VALUES in place.facts.geometry:
+            messages.append(f"shape '{place.facts.name}' (sdfgrid, normals='smooth') is differentiated by its values: "
+                            "what turns black a fraction of a cell beside its outlines moves otherwise than these, and "
+                            "the derivative is 5 % off with 10 values along an axis; use normals='analytic', or more "
+                            "values")  # fmt: skip
+        if values < FINE:
+            messages.append(f"SDF grid '{place.shape.id()}' of {values} values a side is shaded with blended normals, "
+                            "which turn away in a band about a cell wide along its outlines: the derivative takes the "
+                            "band's inner border for the outline, and is up to a third off there; set normals to "
+                            "'analytic', or use a finer grid")  # fmt: skip
+        for message in messages:
             warn_once(message, UnsupportedWarning, job.call.memory)
 
 
