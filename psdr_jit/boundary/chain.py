@@ -174,7 +174,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     slope2 = dr.square(F_x) + dr.square(F_y)
     valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
     along = dr.select(line.horizontal, F_x, F_y)
-    per_F = dr.select(valid, -along / slope2 * found.at.weight / lines.per_pixel, 0)
+    per_F = dr.select(valid, -along / slope2 * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)
     return steps, chain
@@ -293,4 +293,5 @@ TERM = Term(
     cost=cost,
     forward=forward,
     backward=backward,
+    over_film=True,
 )

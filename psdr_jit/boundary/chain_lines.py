@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.film import sampled_window
-from ..core.low_discrepancy import lane_sampler, pixel_sampler
+from ..core.film_samples import FilmSamples
+from ..core.low_discrepancy import lane_sampler
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.rays import skip_emitters
@@ -42,27 +42,22 @@ class Line:
 
 @dataclass(frozen=True)
 class Lines:
-    """The lines of a job, `job.spp` across each pixel, half of them horizontal on average. Host object."""
+    """The lines of a job, `job.spp` across a pixel, half of them horizontal on average. Host object."""
 
     job: Job
     world: ChainWorld
-    count: int
-    pixels: tuple[int, int]
-    corner: tuple[float, float]
+    samples: FilmSamples
     directions: Directions  # of their smooth vertices
 
     @staticmethod
     def of(job: Job) -> Lines:
-        lower, upper = sampled_window(job.film)
-        width, height = (int(n) for n in upper - lower)
         flat = {s.index for s in job.facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         depth = min(job.limits.max_depth, CHAIN_DEPTH)
         world = ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job))
-        count = width * height * job.spp
-        directions = Directions(count, depth)
-        lines = Lines(job, world, count, (width, height), tuple(map(float, lower)), directions)
+        samples = FilmSamples.over(job.film, job.spp, job.density)
+        lines = Lines(job, world, samples, Directions(samples.count, depth))
         lines._guide()
-        dr.eval(directions.data)
+        dr.eval(lines.directions.data)
         return lines
 
     def _guide(self) -> None:
@@ -78,19 +73,21 @@ class Lines:
         return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
 
     def line(self, sample: mi.UInt32) -> Line:
-        rng = pixel_sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample, self.job.spp)
-        pixel, width = sample // varying(mi.UInt32, self.job.spp), varying(mi.UInt32, self.pixels[0])
-        row = pixel // width
-        corner = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + varying(mi.Point2f, self.corner)
+        rng = self.samples.sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample)
+        corner = self.samples.corner_of(self.samples.place(sample)[0])
         horizontal, offset = rng.next_1d() < 0.5, rng.next_1d()
         aperture, wavelength = rng.next_2d(), rng.next_1d()
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
         return Line(start, horizontal, aperture, wavelength)
 
+    def per_pixel(self, sample: mi.UInt32) -> mi.Float:
+        """Expected number of lines of one direction across the pixel of a line."""
+        return self.samples.in_pixel(sample) / 2
+
     @property
-    def per_pixel(self) -> mi.Float:
-        """Expected number of lines of one direction across a pixel."""
-        return varying(mi.Float, self.job.spp / 2)
+    def count(self) -> int:
+        """Number of lines."""
+        return self.samples.count
 
     def film(self, p: mi.Point2f) -> mi.Point2f:
         """Film position p [px] in [0, 1]² of the crop window."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -46,29 +48,36 @@ def _put(block: mi.ImageBlock, film: mi.Film, pos, value, alpha, weight, wavelen
     block.put(pos, channels + [weight], active)
 
 
+@dataclass(frozen=True)
+class FilmPoints:
+    """Where samples are on the film, and what each of them counts."""
+
+    p: mi.Point2f  # [px]
+    weight: mi.Float
+    coalesce: bool  # are neighbouring lanes in the same pixel, mostly?
+
+
 def develop_samples(
-    film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, coalesce: bool, alpha: mi.Float | float = 0.0
+    film: mi.Film, at: FilmPoints, value: mi.Spectrum, wavelengths, alpha: mi.Float | float = 0.0
 ) -> mi.TensorXf:
     """Weighted mean of per-sample values as Mitsuba's renderers form it; attached where `value` is.
 
-    `pos`: film positions [px]. `alpha`: of the samples; of a derivative 0, as it is constant along the interior term.
+    `alpha`: of the samples; of a derivative 0, as it is constant along the interior term.
     """
     clear(film)
     block = film.create_block()
-    block.set_coalesce(block.coalesce() and coalesce)
-    _put(block, film, pos, value, mi.Float(alpha), mi.Float(1), wavelengths, mi.Bool(True))
+    block.set_coalesce(block.coalesce() and at.coalesce)
+    _put(block, film, at.p, value * at.weight, at.weight * alpha, at.weight, wavelengths, mi.Bool(True))
     film.put_block(block)
     return film.develop()
 
 
-def sample_adjoint(
-    film: mi.Film, pos: mi.Point2f, grad_in: mi.TensorXf, wavelengths, coalesce: bool
-) -> mi.Spectrum:
+def sample_adjoint(film: mi.Film, at: FilmPoints, grad_in: mi.TensorXf, wavelengths) -> mi.Spectrum:
     """Adjoint of `develop_samples`: derivative of ⟨grad_in, image⟩ with respect to each sample's value."""
     with dr.resume_grad():
-        value = dr.zeros(mi.Spectrum, dr.width(pos))
+        value = dr.zeros(mi.Spectrum, dr.width(at.p))
         dr.enable_grad(value)
-        backpropagate(develop_samples(film, pos, value, wavelengths, coalesce), grad_in)
+        backpropagate(develop_samples(film, at, value, wavelengths), grad_in)
         adjoint = dr.grad(value)
     clear(film)
     return adjoint

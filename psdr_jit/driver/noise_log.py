@@ -12,14 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import mitsuba as mi
+import numpy as np
 
+from .film_noise import FORGET
 from .pilot import REFRESH, Measurement, variance_of_pair
 
 #: Pairs of images that are looked at in a row, and from then on one in so many calls.
 EAGER, SELDOM = 8, 16
-
-#: Least weight of a new observation: the scene changes as an optimisation goes on.
-FORGET = 0.2
 
 
 @dataclass
@@ -33,7 +32,7 @@ class NoiseLog:
     pairs: int = 0  # of images that were compared since the last pilot
     weighed: dict[tuple[str, str], int] = field(default_factory=dict)  # observations that count, by (form, term)
     last: dict[str, tuple[int, int, str, mi.TensorXf]] = field(default_factory=dict)  # term: (seed, paths, form, image)
-    pending: list[tuple[str, str, int, mi.Float]] = field(default_factory=list)  # (form, term, paths, variance)
+    pending: list[tuple[str, str, int, mi.TensorXf]] = field(default_factory=list)  # (form, term, paths, variance)
 
     @property
     def needs_pilot(self) -> bool:
@@ -73,9 +72,14 @@ class NoiseLog:
         """Let what was observed count."""
         if self.current is None:
             return
-        for form, name, n, variance in self.pending:
+        over_film: dict[tuple[str, str, int], list[np.ndarray]] = {}
+        for form, name, n, pixels in self.pending:
             if name not in self.current.noise[form]:
                 continue
+            variance = np.array(pixels, np.float64)
+            over_film.setdefault((form, name, n), []).append(variance)
             count = self.weighed[form, name] = self.weighed.get((form, name), 0) + 1
-            self.current = self.current.observed(form, name, float(variance[0]), n, max(FORGET, 1 / count))
+            self.current = self.current.observed(form, name, float(variance.mean()), n, max(FORGET, 1 / count))
+        for (form, name, n), seen in over_film.items():
+            self.current = self.current.seen_on_film(form, name, sum(seen) / len(seen), n, len(seen))
         self.pending.clear()

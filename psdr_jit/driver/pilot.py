@@ -17,8 +17,10 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..plan.job import Job
+from .film_noise import FilmNoise
 from .terms import TERMS
 
 #: Independent images per term and sample count, and the paths per pixel of each.
@@ -44,12 +46,19 @@ class TermNoise:
     at_more: float
     p: float
     cost: float
+    film: FilmNoise | None = None  # where it is noisy, if its samples are spread over the film
 
     @staticmethod
     def between(few: float, more: float, cost: float) -> TermNoise:
         """From the variances at `FEW` and `MORE` paths."""
         p = math.log(few / more) / math.log(MORE / FEW) if few > 0 and more > 0 else SLOWEST
         return TermNoise(max(more, 0.0), min(max(p, SLOWEST), FASTEST), cost)
+
+    def spread(self, few: np.ndarray, more: np.ndarray) -> TermNoise:
+        """With samples where the film is noisy: as much better as one half of the pilot, (H, W), tells of the other."""
+        told = FilmNoise.of({FEW: few}, IMAGES).density
+        gain = max(1.0, told.gain(more)) if told is not None else 1.0
+        return replace(self, at_more=self.at_more / gain, film=FilmNoise.of({FEW: few, MORE: more}, IMAGES))
 
     def at(self, n: float) -> float:
         return self.at_more * (n / MORE) ** -self.p
@@ -74,6 +83,14 @@ class Measurement:
     def observed(self, form: str, name: str, variance: float, n: int, weight: float) -> Measurement:
         """See `TermNoise.observed`."""
         terms = {**self.noise[form], name: self.noise[form][name].observed(variance, n, weight)}
+        return Measurement({**self.noise, form: terms})
+
+    def seen_on_film(self, form: str, name: str, variance: np.ndarray, n: int, calls: int) -> Measurement:
+        """See `FilmNoise.seen`."""
+        term = self.noise[form][name]
+        if term.film is None:
+            return self
+        terms = {**self.noise[form], name: replace(term, film=term.film.seen(variance, n, calls))}
         return Measurement({**self.noise, form: terms})
 
     def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
@@ -112,17 +129,18 @@ def measure(
                 _variance([term.forward(job_of(form, FIRST_SEED + k, spp)) for k in range(IMAGES)])
                 for spp in (FEW, MORE)
             )
-            found[form][term.name] = TermNoise.between(few, more, term.cost(form, sky))
+            noise = TermNoise.between(float(few.mean()), float(more.mean()), term.cost(form, sky))
+            found[form][term.name] = noise.spread(few, more) if term.over_film else noise
     return Measurement(found)
 
 
-def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.Float:
-    """Mean over the pixels of the variance of which two images are samples. Not evaluated."""
-    return dr.mean(dr.square(a - b), axis=None).array / 2
+def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.TensorXf:
+    """Of each pixel, (H, W), the mean over its channels: the variance of which two images are samples."""
+    return dr.mean(dr.square(a - b), axis=-1) / 2
 
 
-def _variance(images: list[mi.TensorXf]) -> float:
-    """Mean over the pixels of the variance between images."""
+def _variance(images: list[mi.TensorXf]) -> np.ndarray:
+    """Of each pixel, (H, W), the mean over its channels: the variance between images."""
     mean = sum(images[1:], images[0]) / len(images)
-    spread = sum(dr.mean(dr.square(image - mean), axis=None) for image in images)
-    return float(spread.array[0]) / (len(images) - 1)
+    spread = sum(dr.square(image - mean) for image in images) / (len(images) - 1)
+    return np.array(spread, np.float64).mean(-1)

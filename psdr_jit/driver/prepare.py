@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..core.counters import Counters
 from ..core.film import require_film
+from ..core.film_samples import FilmDensity
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..errors import OptionError, ZeroDerivativeWarning
@@ -72,10 +73,10 @@ class _Question:
         """May budgets follow the measured noise?"""
         return self.call.options.plan == "lean" and not self.call.options.budgets_set
 
-    def job(self, plan: Plan, spp: int) -> Job:
-        """The job of a term that gets `spp` paths per pixel."""
+    def job(self, plan: Plan, spp: int, density: FilmDensity | None = None) -> Job:
+        """The job of a term that gets `spp` paths per pixel, spread over the film as `density` wishes."""
         tubes = tubes_of_call(self.call, self.facts, self.shared)
-        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp)
+        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp, density)
 
 
 def prepare(call: Call) -> Prepared:
@@ -96,7 +97,16 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp)) for t in plan.running], log)
+    jobs = [(by_name[t.name], question.job(plan, t.spp, _density(question, plan, log, t.name))) for t in plan.running]
+    return Prepared(plan, jobs, log)
+
+
+def _density(q: _Question, plan: Plan, log: NoiseLog | None, name: str) -> FilmDensity | None:
+    """Where the pilot has seen noise of the term `name`; evenly where budgets are not ours to choose."""
+    if log is None or log.current is None or not q.automatic or dr.flag(dr.JitFlag.FreezingScope):
+        return None
+    noise = log.current.noise[plan.form].get(name)
+    return None if noise is None or noise.film is None else noise.film.density
 
 
 def _given(options: Options) -> Plan | None:

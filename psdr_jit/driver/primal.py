@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.low_discrepancy import lane_sampler, pixel_sampler
+from ..core.low_discrepancy import lane_sampler
 from ..core.memory import Memory
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
@@ -51,18 +51,18 @@ def bidirectional_image(call: Call) -> mi.TensorXf | None:
 def _from_camera(job: Job, p: CameraPass, limits: PathLimits) -> mi.TensorXf:
     """What camera paths find, at their share of the weights."""
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
-    sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
+    sampler = p.sampler(dr.arange(mi.UInt32, p.samples.count))
     L, _, surface = walk(job.scene, sampler, ray, pi, limits, NoSink(), emission, mi.Bool(True))
     if job.scene.environment() is not None and not job.options.hide_emitters:
         surface = mi.Bool(True)
     alpha = dr.select(surface, mi.Float(1), 0)
     L = job.call.counters.rejected.keep_finite(L)
-    return films.develop_samples(job.film, p.pos, L * p.weight, p.ray.wavelengths, p.spp >= 4, alpha)
+    return films.develop_samples(job.film, p.at, L * p.weight, p.ray.wavelengths, alpha)
 
 
 def _from_light(job: Job, p: CameraPass, limits: PathLimits) -> mi.TensorXf:
     """What light subpaths bring, as many as there are camera samples."""
-    lanes = job.plan.light.subpaths(job.frame, p.spp)
+    lanes = job.plan.light.subpaths(job.frame, p.samples.spp)
     rng = lane_sampler(stream_seed(p.seed, Stream.LIGHT_SUBPATH), dr.arange(mi.UInt32, lanes))
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     start = limits.light.sources.sample(rng, wavelengths)

@@ -15,7 +15,9 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import accumulate
-from ..core.low_discrepancy import pixel_sampler
+from ..core.camera_rays import camera_rays
+from ..core.film_samples import FilmSamples
+from ..core.low_discrepancy import LaneSampler
 from ..core.memory import Slot
 from ..core.streams import Stream, stream_seed
 from ..options import Options
@@ -40,6 +42,9 @@ from .sweeps import backward_sweep, forward_sweep
 #: What vertices do from the second on, by form: slide along their rays, or stay on their material.
 FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow}
 
+#: Samples per pixel from which the film adds up those of a pixel before it writes.
+COALESCED = 4
+
 #: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
 NOMINAL_DEPTH = 16
 
@@ -55,24 +60,16 @@ MOST_PATHS = 0.6
 class CameraPass:
     """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
 
-    spp: int
+    samples: FilmSamples
     share: float  # of the term's samples
     seed: mi.UInt32
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
-    pos: mi.Point2f
+    at: films.FilmPoints
 
-
-class _CameraSampler:
-    """What `ADIntegrator.sample_rays` asks of a sampler, with `spp` well-spread samples in every pixel."""
-
-    def __init__(self, seed: mi.UInt32, pixels: int, spp: int):
-        self._lanes = pixel_sampler(seed, dr.arange(mi.UInt32, pixels * spp), spp)
-        self._spp = spp
-        self.next_1d, self.next_2d = self._lanes.next_1d, self._lanes.next_2d
-
-    def sample_count(self) -> int:
-        return self._spp
+    def sampler(self, lane: mi.UInt32) -> LaneSampler:
+        """What is random about the paths of these samples."""
+        return self.samples.sampler(self.seed, lane)
 
 
 def camera_passes(job: Job) -> Iterator[CameraPass]:
@@ -84,9 +81,12 @@ def camera_passes(job: Job) -> Iterator[CameraPass]:
     size = PathRecords.BYTES_RGB * depth * (1 if job.light is None else 1 + job.plan.light.per_sample)
     for share, part in passes(job, size, pixels):
         films.clear(film)
-        sampler = _CameraSampler(stream_seed(part.seed, Stream.CAMERA), pixels, part.spp)
-        ray, weight, pos = job.call.integrator.sample_rays(job.scene, job.sensor, sampler)
-        yield CameraPass(part.spp, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, pos)
+        samples = FilmSamples.over(film, part.spp, part.density)
+        lane = dr.arange(mi.UInt32, samples.count)
+        rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
+        ray, weight, p = camera_rays(job.sensor, samples, rng, lane)
+        at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
+        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at)
 
 
 def every_path_differs(job: Job) -> bool:
@@ -121,7 +121,7 @@ def _limits(job: Job) -> PathLimits:
 def _along_the_walk(job: Job, p: CameraPass) -> mi.Spectrum:
     """Derivative of every path's radiance by the materials and lights it meets, without records."""
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
-    sampler = pixel_sampler(p.seed, dr.arange(mi.UInt32, dr.width(p.pos)), p.spp)
+    sampler = p.sampler(dr.arange(mi.UInt32, p.samples.count))
     lights = any(e.radiance for e in job.facts.emitters)
     sink = (RadianceTangents if lights else MaterialTangents).zero(job.facts.has_delta_lobes)
     walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
@@ -134,11 +134,11 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
-    lane = dr.arange(mi.UInt32, dr.width(p.pos))
+    lane = dr.arange(mi.UInt32, p.samples.count)
     dr.eval(ray, lane)
 
     if not every_path_differs(job) and job.call.memory[TOUCHED_SHARE] < MOST_PATHS:
-        sampler = pixel_sampler(p.seed, lane, p.spp)
+        sampler = p.sampler(lane)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
         job.call.memory[TOUCHED_SHARE] = dr.width(lane) / dr.width(found)
@@ -148,10 +148,10 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
 
     depth = limits.max_depth
     if job.options.max_depth == -1:
-        depth = count_vertices(job.scene, pixel_sampler(p.seed, lane, p.spp), ray, limits, job.options.hide_emitters)
+        depth = count_vertices(job.scene, p.sampler(lane), ray, limits, job.options.hide_emitters)
     records = PathRecords(dr.width(lane), depth)
     ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
-    sampler = pixel_sampler(p.seed, lane, p.spp)
+    sampler = p.sampler(lane)
     _, records.count, _ = walk(
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
@@ -185,7 +185,7 @@ def _derivatives(job: Job, p: CameraPass) -> mi.Spectrum:
     if paths_rest(job):
         return _along_the_walk(job, p)
     records, lane = _record(job, p)
-    dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+    dL = dr.zeros(mi.Spectrum, p.samples.count)
     if dr.width(lane) > 0:
         o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
         if job.facts.camera_moves:
@@ -203,7 +203,7 @@ def forward(job: Job) -> mi.TensorXf:
     with dr.suspend_grad():
         for p in camera_passes(job):
             dL = _derivatives(job, p)
-            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+            image += p.share * films.develop_samples(job.film, p.at, dL * p.weight, p.ray.wavelengths)
             found = _from_light(job, p)
             if found is not None:
                 image += p.share * light_traced.forward(job, found, flow_of(job))
@@ -212,7 +212,7 @@ def forward(job: Job) -> mi.TensorXf:
 
 def _from_light(job: Job, p: CameraPass) -> light_traced.LightTraced | None:
     """What light subpaths find, as many as there are camera samples."""
-    return None if job.light is None else light_traced.find_paths(job, p.seed, p.spp, _limits(job))
+    return None if job.light is None else light_traced.find_paths(job, p.seed, p.samples.spp, _limits(job))
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
@@ -225,7 +225,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             records, lane = _record(job, p)
             if dr.width(lane) == 0:
                 continue
-            δL = p.share * p.weight * films.sample_adjoint(job.film, p.pos, grad_in, p.ray.wavelengths, p.spp >= 4)
+            δL = p.share * p.weight * films.sample_adjoint(job.film, p.at, grad_in, p.ray.wavelengths)
             δL = dr.gather(mi.Spectrum, δL, lane)
             λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
             if job.facts.camera_moves:
@@ -255,4 +255,5 @@ TERM = Term(
     cost=lambda form, sky: 1.0,
     forward=forward,
     backward=backward,
+    over_film=True,
 )

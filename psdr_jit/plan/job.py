@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
+from ..core.film_samples import FilmDensity
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..options import Options
@@ -39,6 +40,7 @@ class Job:
     motion: Motion  # the scene's own, or a probe in its place (forward mode only)
     shared: Memory  # of all terms of one render call
     spp: int
+    density: FilmDensity | None = None  # where on the film samples of this term are wanted; None: everywhere
 
     @property
     def scene(self) -> mi.Scene:

@@ -45,3 +45,4 @@ class Term:
     forward: Callable[[Job], mi.TensorXf]
     backward: Callable[[Job, mi.TensorXf], None]
     edges: EdgeSampling | None = None
+    over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy

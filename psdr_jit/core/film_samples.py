@@ -1,0 +1,133 @@
+"""How many samples each pixel of the film gets: the same number everywhere, or more where a term is noisy.
+
+In every pixel samples are uniform, and their numbers are settled before any of them is drawn: with 1/n_i on each of
+n_i samples a pixel's mean is unbiased for any n_i ≥ 1. The variance Σ v_i/n_i of an image is least for n_i ∝ √v_i,
+where v_i is that of one sample. It is known from a few samples only (`driver/pilot.py`), so a share of the samples
+goes evenly to all pixels: what the pilot has missed costs at most 1/`EVEN_SHARE` times the variance it has anyway.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .film import sampled_window
+from .low_discrepancy import LaneSampler, pixel_sampler
+from .upload import uploaded
+from .varying import varying
+
+#: Share of the samples that is spread evenly; at least one in every pixel is.
+EVEN_SHARE = 0.25
+
+#: Least noise of a pixel that counts, relative to the mean over the film: the pilot sees nothing in many.
+LEAST_NOISE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FilmDensity:
+    """Wishes for samples relative to the mean number, (H, W), of the crop window; mean 1. Host object."""
+
+    relative: np.ndarray
+
+    @staticmethod
+    def of(variance: np.ndarray) -> FilmDensity | None:
+        """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise."""
+        spread = np.sqrt(_smoothed(np.asarray(variance, np.float64)))
+        if not spread.mean() > 0 or not np.isfinite(spread).all():
+            return None
+        spread += LEAST_NOISE * spread.mean()
+        return FilmDensity(spread / spread.mean())
+
+    def counts(self, shape: tuple[int, int], spp: int) -> np.ndarray:
+        """Samples of each pixel of the sampled window, (H, W) of integers ≥ 1, `spp` on average."""
+        margin = [((n - m) // 2, (n - m) - (n - m) // 2) for n, m in zip(shape, self.relative.shape, strict=True)]
+        wish = np.pad(self.relative, margin, mode="edge").ravel()
+        even = max(1, round(EVEN_SHARE * spp))
+        upto = np.cumsum(wish) * ((spp - even) * wish.size / wish.sum())
+        return even + np.diff(np.floor(upto + 0.5), prepend=0).astype(np.int64).reshape(shape)
+
+    @property
+    def expected(self) -> np.ndarray:
+        """Samples of each pixel relative to the mean, (H, W), if there are many."""
+        return EVEN_SHARE + (1 - EVEN_SHARE) * self.relative
+
+    def gain(self, variance: np.ndarray) -> float:
+        """By which factor the mean of `variance` (H, W) of equally many samples falls, if there are many."""
+        mean = float(np.mean(variance / self.expected))
+        return float(np.mean(variance)) / mean if mean > 0 else 1.0
+
+
+def _smoothed(variance: np.ndarray) -> np.ndarray:
+    """Mean over the pixel and its neighbours, as far as there are any."""
+    rows, columns = variance.shape
+    padded = np.pad(variance, 1, mode="edge")
+    return sum(padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)) / 9
+
+
+@dataclass(frozen=True, eq=False)
+class FilmSamples:
+    """Samples of one pass, pixel after pixel: lane → pixel. Host object, not loop state."""
+
+    corner: tuple[float, float]  # of the sampled window [px]
+    size: tuple[int, int]  # its width and height [px]
+    spp: int  # on average
+    first: mi.UInt32 | None = None  # lane of the first sample of every pixel, and of one more; None: `spp` in each
+    pixels: mi.UInt32 | None = None  # pixel of every lane
+
+    @staticmethod
+    def over(film: mi.Film, spp: int, density: FilmDensity | None = None) -> FilmSamples:
+        """`spp` samples per pixel of the sampled window of `film`, spread as `density` wishes."""
+        lower, upper = sampled_window(film)
+        size = tuple(int(n) for n in upper - lower)
+        even = FilmSamples(tuple(map(float, lower)), size, spp)
+        if density is None or spp < 2:
+            return even
+        counts = density.counts((size[1], size[0]), spp).ravel()
+        first = uploaded(mi.UInt32, np.concatenate([[0], np.cumsum(counts)]))
+        begins = dr.zeros(mi.UInt32, int(counts.sum()))
+        dr.scatter(begins, mi.UInt32(1), dr.gather(mi.UInt32, first, dr.arange(mi.UInt32, counts.size - 1) + 1))
+        pixels = dr.cumsum(begins)
+        return FilmSamples(even.corner, size, spp, first, pixels)
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.size[0] * self.size[1] * self.spp
+
+    def place(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+        """`(pixel, number among its samples)`."""
+        if self.pixels is None:
+            per_pixel = varying(mi.UInt32, self.spp)
+            pixel = lane // per_pixel
+            return pixel, lane - pixel * per_pixel
+        pixel = dr.gather(mi.UInt32, self.pixels, lane)
+        return pixel, lane - dr.gather(mi.UInt32, self.first, pixel)
+
+    def sampler(self, seed: mi.UInt32, lane: mi.UInt32) -> LaneSampler:
+        """A sequence of random numbers for every pixel, well spread over its samples."""
+        if self.pixels is None:
+            return pixel_sampler(seed, lane, self.spp)
+        pixel, number = self.place(lane)
+        return LaneSampler(number, mi.sample_tea_32(seed, pixel)[0])
+
+    def corner_of(self, pixel: mi.UInt32) -> mi.Point2f:
+        """Film position of the upper left corner of `pixel` [px]."""
+        width = varying(mi.UInt32, self.size[0])
+        row = pixel // width
+        return mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + varying(mi.Point2f, self.corner)
+
+    def in_pixel(self, lane: mi.UInt32) -> mi.Float:
+        """Number of samples of the pixel of `lane`."""
+        if self.pixels is None:
+            return varying(mi.Float, self.spp)
+        pixel = dr.gather(mi.UInt32, self.pixels, lane)
+        return mi.Float(dr.gather(mi.UInt32, self.first, pixel + 1) - dr.gather(mi.UInt32, self.first, pixel))
+
+    def weight(self) -> mi.Float:
+        """Of every sample, for means: 1 on average over the film."""
+        if self.pixels is None:
+            return mi.Float(1)
+        return varying(mi.Float, self.spp) / self.in_pixel(dr.arange(mi.UInt32, self.count))

@@ -1,0 +1,45 @@
+"""Where on the film a term is noisy: variances of single samples by pixel, from the pilot and from calls since.
+
+Pixels are compared with each other only, so samples count as independent here; what stratification gains on top is in
+the term's own law (`pilot.TermNoise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..core.film_samples import FilmDensity
+
+#: Least share of what was seen last: the scene changes as an optimisation goes on.
+FORGET = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class FilmNoise:
+    """What is known after some samples. Host object."""
+
+    variance: np.ndarray  # (H, W), of one sample
+    samples: float  # per pixel: how many have told
+
+    @staticmethod
+    def of(images: Mapping[int, np.ndarray], count: int) -> FilmNoise:
+        """From variances (H, W) between `count` images, by their samples per pixel."""
+        noise = [FilmNoise(spp * variance, (count - 1) * spp) for spp, variance in images.items()]
+        total = sum(n.samples for n in noise)
+        return FilmNoise(sum(n.variance * (n.samples / total) for n in noise), total)
+
+    @cached_property
+    def density(self) -> FilmDensity | None:
+        """Where samples are wanted; None: nowhere in particular."""
+        return FilmDensity.of(self.variance)
+
+    def seen(self, variance: np.ndarray, spp: int, calls: int) -> FilmNoise:
+        """With the mean variance (H, W) of `calls` images of `spp` samples per pixel, drawn by this density."""
+        there = self.density.expected if self.density is not None else 1.0
+        before = min(self.samples, calls * spp * (1 / FORGET - 1))
+        new = calls * spp / (before + calls * spp)
+        return FilmNoise((1 - new) * self.variance + new * spp * there * variance, before + calls * spp)
