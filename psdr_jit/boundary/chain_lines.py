@@ -17,10 +17,8 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.rays import skip_emitters
 from ..plan.job import Job
-from ..plan.probe_motion import registry_table
 from .chain_fixed import Directions
-from .chain_patterns import ChainPatterns
-from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Pair, guide, trace_pair
+from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
 
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
 LEAST_WIDTH, ROUNDING = 2.0**-14, 5e-7
@@ -51,11 +49,9 @@ class Lines:
 
     @staticmethod
     def of(job: Job) -> Lines:
-        flat = {s.index for s in job.facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
-        depth = min(job.limits.max_depth, CHAIN_DEPTH)
-        world = ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job))
+        world = ChainWorld.of(job)
         samples = FilmSamples.over(job.film, job.spp, job.density)
-        lines = Lines(job, world, samples, Directions(samples.count, depth))
+        lines = Lines(job, world, samples, Directions(samples.count, world.depth))
         lines._guide()
         dr.eval(lines.directions.data)
         return lines

@@ -10,7 +10,8 @@ variance of a corner, times n − 1: what is too narrow to matter is not looked 
 As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind. What lies in front
 waits for the next kernel; so do, while there are many, intervals that take longer than others.
 
-Crossings of the first segment are not kept, only walked around: they belong to the primary boundary.
+Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
+ends agree otherwise. Crossings of the first segment are not kept either: they belong to the primary boundary.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
 
 #: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
 NARROWEST = 2.0**-10
+
+#: Width at which halving ends on steps that rest [px]: they are only walked around.
+AT_REST = 2.0**-4
 
 #: Looks at an interval and its halves in the first kernel; each further one has twice as many.
 FIRST_LOOKS = 2
@@ -94,11 +98,13 @@ class Search:
     mode: mi.UInt32  # LOOK at the whole interval, HALVE it between lo and hi, CHECK what halving came to, or END
     lo: mi.Float
     hi: mi.Float
+    moves: mi.Bool  # can the step that it halves to?
 
     @staticmethod
     def begin(at: Interval) -> Search:
         n = dr.width(at.sample)
-        return Search(at, dr.full(mi.UInt32, LOOK, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
+        nothing = dr.zeros(mi.Float, n)
+        return Search(at, dr.full(mi.UInt32, LOOK, n), nothing, mi.Float(nothing), dr.zeros(mi.Bool, n))
 
 
 LOOK, HALVE, CHECK, END = range(4)
@@ -142,21 +148,28 @@ def _searched(lines: Lines, search: Search, pause: tuple[mi.UInt32, mi.Bool], fi
         pair = lines.compare(at.sample, (start, end))
 
         apart = look & pair.differs & pair.specular
-        hi = dr.select(apart, at.hi, dr.select(halve & pair.differs, middle, search.hi))
-        lo = dr.select(apart, at.lo, dr.select(halve & ~pair.differs, middle, search.lo))
+        first = halve & pair.differs & (pair.moves | ~search.moves)  # what moves is sought rather than what rests
+        hi = dr.select(apart, at.hi, dr.select(first, middle, search.hi))
+        lo = dr.select(apart, at.lo, dr.select(halve & ~first, middle, search.lo))
         crossed, checked = (search.mode == CHECK) & pair.differs, search.mode == CHECK
-        front = Interval(at.sample, at.lo, lo, at.weight, _key(at, 0))
+        moves = dr.select(apart | first | checked, pair.moves, search.moves)
+        again = crossed & moves & (hi - lo > least)  # taken for one that rests
+        crossed &= ~again
+        front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
-        finds.write(slot, Crossing(where, pair.k), _part(front, mi.Bool(True)), crossed)
+        crossing = Crossing(where, dr.select(moves, pair.k, 0))
+        finds.write(slot, crossing, _part(front, mi.Bool(True)), crossed)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         chosen, part = _part(at, pair.specular | checked)
         behind = Interval(at.sample, hi, at.hi, at.weight, _key(at, 1))
-        ends = ((look & ~apart) | (checked & ~crossed)) & ~chosen
-        mode = dr.select(apart | halve, dr.select(hi - lo > least, mi.UInt32(HALVE), CHECK), LOOK)
+        halved = apart | halve | again
+        ends = ((look & ~apart) | (checked & ~crossed & ~again)) & ~chosen
+        narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
+        mode = dr.select(halved, dr.select(narrow, mi.UInt32(CHECK), HALVE), LOOK)
         mode = dr.select(ends, END, mode)
-        at = dr.select(apart | halve, at, dr.select(crossed, behind, part))
-        search = Search(at, mode, lo, hi)
+        at = dr.select(halved, at, dr.select(crossed, behind, part))
+        search = Search(at, mode, lo, hi, moves)
         looks += dr.select(look, mi.UInt32(1), 0)
         pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == SLOTS))) | (apart & before_halving)
         active = (mode != END) & ~pauses

@@ -22,6 +22,8 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
+from ..plan.job import Job
+from ..plan.probe_motion import registry_table
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lobes import has_delta, leave, reflected_share, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
@@ -45,6 +47,28 @@ class ChainWorld:
     depth: int  # largest number of segments
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
     patterns: ChainPatterns | None  # None: no surface steps inside
+    moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape; [0]: because the camera does
+    lights: mi.Bool  # may steps move because lights do?
+
+    @staticmethod
+    def of(job: Job) -> ChainWorld:
+        facts = job.facts
+        flat = {s.index for s in facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
+        changing = {s.index for s in facts.shapes if s.geometry or s.shading or s.material}
+        moving = registry_table(job.scene, changing)
+        dr.scatter(moving, varying(mi.UInt32, int(facts.camera_moves)), mi.UInt32(0))
+        lights = facts.emitters_move or any(s.is_emitter and s.index in changing for s in facts.shapes)
+        depth = min(job.limits.max_depth, CHAIN_DEPTH)
+        return ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job), moving,
+                          varying(mi.Bool, lights))  # fmt: skip
+
+    def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
+        """May a step move because of one of `shapes`, or of the camera? As pointers or by registry index."""
+        found = mi.UInt32(0)
+        for shape in (mi.UInt32(0), *shapes):
+            index = shape if isinstance(shape, mi.UInt32) else dr.reinterpret_array(mi.UInt32, shape)
+            found |= dr.gather(mi.UInt32, self.moving, index)
+        return found != 0
 
 
 @dataclass
@@ -54,6 +78,7 @@ class Pair:
     k: mi.UInt32  # number of the segment, 0: from the sensor
     differs: mi.Bool
     specular: mi.Bool  # some vertex on the way, or where they part, has a delta lobe
+    moves: mi.Bool  # something on the way, or where they part, can move: elsewhere a step stays where it is
     emits: mi.Bool  # does what segment k ends at count with its emission?
     in_light: mi.Bool  # they part in what they see of `light` from the end of segment k, which they share
     seen: mi.Bool  # it is the first that sees it
@@ -69,7 +94,7 @@ class Pair:
         no, hit = mi.Bool(False), Hit.made(dr.zeros, 1)
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         k, family, β = mi.UInt32(0), mi.UInt32(NO_FAMILY), mi.Spectrum(1)
-        return Pair(k, no, no, mi.Bool(True), no, no, family, light, hit, hit, β, β)
+        return Pair(k, no, no, no, mi.Bool(True), no, no, family, light, hit, hit, β, β)
 
     @property
     def last(self) -> mi.UInt32:
@@ -183,10 +208,11 @@ def trace_pair(
             pair.differs |= crossed
             pair.family = dr.select(active, family, pair.family)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
+        pair.moves |= world.moves(a.shape, b.shape)
         u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
 
-        pair = compare_light(world.scene, pair, (a, b), u, active & (pair.k > 0))
+        pair = compare_light(world, pair, (a, b), u, active & (pair.k > 0))
         active &= ~pair.differs
         direction = directions.read(pair.k, line, active)
         on_a, on_b = leave(a, pair.k, u.lobe, direction, active), leave(b, pair.k, u.lobe, direction, active)
@@ -201,18 +227,19 @@ def trace_pair(
     return pair
 
 
-def compare_light(scene: mi.Scene, pair: Pair, ends: tuple, u: Numbers, active: mi.Bool) -> Pair:
+def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active: mi.Bool) -> Pair:
     """Do the chains see the same of a point of light, from the surface interactions `ends`?"""
     a, b = ends
     active = active & mi.has_flag(a.bsdf().flags(), mi.BSDFFlags.Smooth)
-    light = draw_light(scene, u.emitter, u.light, active)
-    hit_a, seen_a = light.seen_from(scene, a, active)
-    hit_b, seen_b = light.seen_from(scene, b, active)
+    light = draw_light(world.scene, u.emitter, u.light, active)
+    hit_a, seen_a = light.seen_from(world.scene, a, active)
+    hit_b, seen_b = light.seen_from(world.scene, b, active)
     parts = active & (seen_a != seen_b)
     return Pair(
         k=pair.k,
         differs=pair.differs | parts,
         specular=pair.specular,
+        moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))),
         emits=pair.emits,
         in_light=parts,
         seen=seen_a,

@@ -8,7 +8,10 @@ goes evenly to all pixels: what the pilot has missed costs at most 1/`EVEN_SHARE
 
 from __future__ import annotations
 
+import base64
+import zlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -22,15 +25,19 @@ from .varying import varying
 #: Share of the samples that is spread evenly; at least one in every pixel is.
 EVEN_SHARE = 0.25
 
-#: Least noise of a pixel that counts, relative to the mean over the film: the pilot sees nothing in many.
+#: Noise, relative to the mean over the film, that pixels are believed to have on top: the pilot sees none in many.
 LEAST_NOISE = 0.02
 
+#: Resolution of wishes, and the level of the mean.
+STEPS_PER_OCTAVE, ZERO_LEVEL = 8, 64
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True)
 class FilmDensity:
-    """Wishes for samples relative to the mean number, (H, W), of the crop window; mean 1. Host object."""
+    """Wishes for samples relative to the mean number, on the pixels of the crop window. Host object, plain text."""
 
-    relative: np.ndarray
+    shape: tuple[int, int]  # (H, W)
+    levels: str  # logarithms of the wishes in steps of 1/`STEPS_PER_OCTAVE`, a byte each; compressed, in base64
 
     @staticmethod
     def of(variance: np.ndarray) -> FilmDensity | None:
@@ -38,16 +45,34 @@ class FilmDensity:
         spread = np.sqrt(_smoothed(np.asarray(variance, np.float64)))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
-        spread += LEAST_NOISE * spread.mean()
-        return FilmDensity(spread / spread.mean())
+        relative = spread / spread.mean() + LEAST_NOISE
+        levels = np.round(STEPS_PER_OCTAVE * np.log2(relative)) + ZERO_LEVEL
+        packed = zlib.compress(np.clip(levels, 0, 255).astype(np.uint8).tobytes())
+        return FilmDensity(tuple(spread.shape), base64.b64encode(packed).decode())
 
-    def counts(self, shape: tuple[int, int], spp: int) -> np.ndarray:
-        """Samples of each pixel of the sampled window, (H, W) of integers ≥ 1, `spp` on average."""
-        margin = [((n - m) // 2, (n - m) - (n - m) // 2) for n, m in zip(shape, self.relative.shape, strict=True)]
-        wish = np.pad(self.relative, margin, mode="edge").ravel()
+    @cached_property
+    def relative(self) -> np.ndarray:
+        """(H, W), mean 1. Raises ValueError for a text that `of` has not written."""
+        levels = np.frombuffer(zlib.decompress(base64.b64decode(self.levels)), np.uint8).reshape(self.shape)
+        relative = 2.0 ** ((levels.astype(float) - ZERO_LEVEL) / STEPS_PER_OCTAVE)
+        return relative / relative.mean()
+
+    def counts(self, film: mi.Film, spp: int) -> np.ndarray:
+        """Samples of each pixel of the sampled window, (H, W) of integers ≥ 1, `spp` on average.
+
+        On another film it is that of the same place in its crop window; beside it that of the nearest pixel.
+        """
+        lower, upper = sampled_window(film)
+        columns, rows = (
+            np.clip(((np.arange(lo, hi) + 0.5 - first) * n / size).astype(int), 0, n - 1)
+            for lo, hi, first, size, n in zip(lower, upper, film.crop_offset(), film.crop_size(), self.shape[::-1],
+                                              strict=True)  # fmt: skip
+        )
+        wish = self.relative[np.ix_(rows, columns)].ravel()
         even = max(1, round(EVEN_SHARE * spp))
         upto = np.cumsum(wish) * ((spp - even) * wish.size / wish.sum())
-        return even + np.diff(np.floor(upto + 0.5), prepend=0).astype(np.int64).reshape(shape)
+        extra = np.diff(np.floor(upto + 0.5), prepend=0).astype(np.int64)
+        return even + extra.reshape(len(rows), len(columns))
 
     @property
     def expected(self) -> np.ndarray:
@@ -85,7 +110,7 @@ class FilmSamples:
         even = FilmSamples(tuple(map(float, lower)), size, spp)
         if density is None or spp < 2:
             return even
-        counts = density.counts((size[1], size[0]), spp).ravel()
+        counts = density.counts(film, spp).ravel()
         first = uploaded(mi.UInt32, np.concatenate([[0], np.cumsum(counts)]))
         begins = dr.zeros(mi.UInt32, int(counts.sum()))
         dr.scatter(begins, mi.UInt32(1), dr.gather(mi.UInt32, first, dr.arange(mi.UInt32, counts.size - 1) + 1))

@@ -97,16 +97,14 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    jobs = [(by_name[t.name], question.job(plan, t.spp, _density(question, plan, log, t.name))) for t in plan.running]
-    return Prepared(plan, jobs, log)
+    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t.film)) for t in plan.running], log)
 
 
-def _density(q: _Question, plan: Plan, log: NoiseLog | None, name: str) -> FilmDensity | None:
-    """Where the pilot has seen noise of the term `name`; evenly where budgets are not ours to choose."""
-    if log is None or log.current is None or not q.automatic or dr.flag(dr.JitFlag.FreezingScope):
-        return None
-    noise = log.current.noise[plan.form].get(name)
-    return None if noise is None or noise.film is None else noise.film.density
+def _spread(plan: Plan, measured: Measurement) -> Plan:
+    """The plan with samples where on the film noise was seen."""
+    noise = measured.noise[plan.form]
+    films = {name: n.film.density for name, n in noise.items() if n.film is not None}
+    return replace(plan, terms=tuple(replace(t, film=films.get(t.name)) if t.runs else t for t in plan.terms))
 
 
 def _given(options: Options) -> Plan | None:
@@ -136,7 +134,7 @@ def _as_given(plan: Plan, q: _Question) -> Plan:
             "other parameters or another scene; make it anew with psdr_jit.make_plan"
         )
     budgets = {t.name: q.call.options.budget(t.budget) for t in TERMS}
-    off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0}
+    off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0, "film": None}
     return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
 
 
@@ -196,7 +194,11 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
         log.share = (spp, form, why)
     log.calls += 1
     # Which terms run is decided anew in every call: the scene may have changed since.
-    return plan if log.share is None else made(*log.share), log
+    if log.share is None:
+        return plan, log
+    plan = made(*log.share)
+    spreads = automatic and not dr.flag(dr.JitFlag.FreezingScope)
+    return _spread(plan, log.current) if spreads else plan, log
 
 
 def _geometry(q: _Question, prunes: bool) -> Geometry:

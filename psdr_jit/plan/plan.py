@@ -12,6 +12,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
+from ..core.film_samples import FilmDensity
 from ..errors import OptionError
 from ..options import FORMS
 from .light_plan import LightPlan
@@ -46,6 +47,7 @@ class TermPlan:
     streams: tuple[str, ...]  # of random numbers, see `streams`
     segments: int  # expected path segments per pixel, 0 unless it runs
     edges: EdgeCount | None = None  # None: not a boundary term, or not counted
+    film: FilmDensity | None = None  # where on the film its samples are; None: evenly, or they do not begin there
 
 
 @dataclass(frozen=True)
@@ -96,14 +98,20 @@ class Plan:
             rows.append((t.name, "runs" if t.runs else "out", *numbers, t.reason))
             if t.edges is not None:
                 rows.append(("", "", "", "", str(t.edges)))
+            if t.film is not None:
+                rows.append(("", "", "", "", "more samples where the film is noisy"))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines += ["  ".join([row[k].ljust(widths[k]) for k in range(4)] + [row[4]]).rstrip() for row in rows]
         return "\n".join(lines)
 
 
 def _term_plan(data: dict) -> TermPlan:
-    edges = data.pop("edges")
-    term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=None if edges is None else EdgeCount(**edges))
+    edges, film = data.pop("edges"), data.pop("film", None)
+    edges = None if edges is None else EdgeCount(**edges)
+    film = None if film is None else FilmDensity(tuple(film["shape"]), film["levels"])
+    if film is not None and film.relative.shape != film.shape:
+        raise ValueError("its samples have no place on the film")
+    term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=edges, film=film)
     if not (isinstance(term.name, str) and isinstance(term.runs, bool) and type(term.spp) is int):
         raise TypeError("a term has a name, runs or not, and has a whole number of paths per pixel")
     if (term.spp > 0) != term.runs:

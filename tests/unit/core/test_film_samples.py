@@ -14,7 +14,7 @@ SPP, WIDTH, HEIGHT = 8, 6, 5
 
 
 def film(**more) -> mi.Film:
-    return mi.load_dict({"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgb", **more})
+    return mi.load_dict({"type": "hdrfilm", "pixel_format": "rgb", **{"width": WIDTH, "height": HEIGHT, **more}})
 
 
 def noisy_corner() -> FilmDensity:
@@ -33,6 +33,19 @@ def test_every_pixel_has_its_share_and_the_noisy_ones_the_rest(llvm):
     assert counts.sum() == SPP * WIDTH * HEIGHT
     assert counts.min() == EVEN_SHARE * SPP
     assert counts[:2, :2].min() > 3 * SPP
+
+
+def test_text_and_back(llvm):
+    """Another process that is given the text draws the same numbers of samples."""
+    density = noisy_corner()
+    again = FilmDensity(density.shape, density.levels)
+    assert again == density and (again.counts(film(), SPP) == density.counts(film(), SPP)).all()
+
+
+def test_other_films_take_the_same_place(llvm):
+    counts = noisy_corner().counts(film(width=2 * WIDTH, height=2 * HEIGHT), SPP)
+    assert counts.shape == (2 * HEIGHT, 2 * WIDTH) and counts.sum() == SPP * counts.size
+    assert counts[:4, :4].min() > 3 * SPP > 2 * counts[5:, 5:].max()
 
 
 def test_numbers_within_a_pixel_count_up_from_zero(llvm):
