@@ -176,7 +176,8 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
         return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
 
     plan = made(budgets, (forms[0], reason), "equal")
-    automatic = q.automatic and len(plan.running) > 1
+    over_film = {t.name for t in TERMS if t.over_film}
+    automatic = q.automatic and (len(plan.running) > 1 or any(t.name in over_film for t in plan.running))
     if not plan.running or (len(forms) == 1 and not automatic):
         return plan, None
     log = call.memory[NOISE].setdefault((call.options, *_kind(q, forms), *budgets.values()), NoiseLog())
