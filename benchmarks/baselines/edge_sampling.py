@@ -157,32 +157,32 @@ def secondary_boundary(job: Job) -> mi.TensorXf:
         for p in camera_passes(job):
             dL = job.call.counters.rejected.keep_finite(along_paths(job, table, dist, p))
             dr.eval(dL)  # the splat below reads it inside a recorded loop, where pending writes are not seen
-            image += p.share * films.develop_samples(job.film, p.pos, dL * p.weight, p.ray.wavelengths, p.spp >= 4)
+            image += p.share * films.develop_samples(job.film, p.at, dL * p.weight, p.ray.wavelengths)
     return image
 
 
 def along_paths(job: Job, table: EdgeTable, dist: EdgeDistribution, p) -> mi.Spectrum:
     """Derivative of the radiance of every camera ray of the pass `p` by its secondary boundaries."""
-    dL = dr.zeros(mi.Spectrum, dr.width(p.pos))
+    dL = dr.zeros(mi.Spectrum, p.samples.count)
     path = first_arrivals(job, p)
     k = 1  # the vertex: x_k
     # one segment is left for the emitter
     while k < job.options.depth_limit and path is not None:
         seed = mi.sample_tea_32(p.seed, mi.UInt32(k))[0]
         si, u = arrive(path)
-        view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.spp)
+        view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.samples.spp)
         if view is not None:
             rng = stream_seed(seed, Stream.INDIRECT_RADIANCE)
-            dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.spp))
+            dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.samples.spp))
         if k + 1 < job.options.depth_limit:
-            path = go_on(job, path, si, u, k, stream_seed(seed, Stream.INDIRECT_SUBPATH), p.spp)
+            path = go_on(job, path, si, u, k, stream_seed(seed, Stream.INDIRECT_SUBPATH), p.samples.spp)
         k += 1
     return dL
 
 
 def first_arrivals(job: Job, p) -> CameraPath | None:
     """Camera rays that meet a surface."""
-    n = dr.width(p.pos)
+    n = p.samples.count
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
     if job.facts.camera_moves:
         with dr.resume_grad():

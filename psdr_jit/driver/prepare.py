@@ -40,6 +40,9 @@ from .terms import TERMS
 #: Why a term that is needed may be left out by a given plan all the same.
 MAY_BE_OUT = (SWITCHED_OFF, NO_EDGES)
 
+#: Why terms have their samples, and pixels theirs.
+BY_NOISE = "by measured noise, of terms and of pixels, as costly as equal ones"
+
 #: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
 NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)
 PILOTS: Slot[dict[tuple, dict[int, Measurement]]] = Slot(dict)
@@ -176,7 +179,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
         return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
 
     plan = made(budgets, (forms[0], reason), "equal")
-    over_film = {t.name for t in TERMS if t.over_film}
+    over_film = {t.name for t in TERMS if t.over_film and q.facts.geometry_moves}  # the pilot's probe is a motion
     automatic = q.automatic and (len(plan.running) > 1 or any(t.name in over_film for t in plan.running))
     if not plan.running or (len(forms) == 1 and not automatic):
         return plan, None
@@ -191,7 +194,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
         spp, why = budgets, "equal"
         if automatic:
             running = {term.name for term in plan.running}
-            spp, why = log.current.allocate(form[0], budgets, running), "by measured noise, as costly as equal ones"
+            spp, why = log.current.allocate(form[0], budgets, running), BY_NOISE
         log.share = (spp, form, why)
     log.calls += 1
     # Which terms run is decided anew in every call: the scene may have changed since.

@@ -98,8 +98,6 @@ class Plan:
             rows.append((t.name, "runs" if t.runs else "out", *numbers, t.reason))
             if t.edges is not None:
                 rows.append(("", "", "", "", str(t.edges)))
-            if t.film is not None:
-                rows.append(("", "", "", "", "more samples where the film is noisy"))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         lines += ["  ".join([row[k].ljust(widths[k]) for k in range(4)] + [row[4]]).rstrip() for row in rows]
         return "\n".join(lines)
