@@ -54,6 +54,7 @@ def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples
         records=records,
         value=value,
         source_motion=lambda moving: mi.Float(0),
+        drawn=view.drawn,
     )
 
 
@@ -178,4 +179,5 @@ TERM = Term(
         lambda job: line_weights(job, USES[job.form]) + horizon_weights(job, NAME, direct=False),
         "the others are coplanar, or lie inside of closed surfaces",
     ),
+    through_edges=True,
 )

@@ -70,6 +70,7 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
         records=records,
         value=value,
         source_motion=lambda moving: dr.dot(turn - b.ratio * v.sight.n_perp, moving.of_surface(b.source)),
+        drawn=v.drawn,
     )
 
 

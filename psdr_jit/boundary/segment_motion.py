@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
+from ..core.line_guide import Drawn
 from ..edges.location import EdgeLocation
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
@@ -43,6 +44,7 @@ class BoundarySamples:
     records: SubpathRecords
     value: mi.Spectrum  # flat: splatted per unit of motion
     source_motion: Callable[[Displacements], mi.Float]  # attached, per lane, primal value 0
+    drawn: Drawn | None = None  # how the lines were chosen, if they can be guided
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,10 @@ def _derivative_image(job: Job, term: SecondaryTerm) -> mi.TensorXf:
         m = _motion(job, edges, s, moving)
         at_edge, connect, go_on, camera = tangents(m.segment, m.connect, m.go_on, m.camera)
     motion = dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
-    return _splat(job, s, job.call.counters.rejected.keep_finite(mi.Color1f(motion)).x)
+    motion = job.call.counters.rejected.keep_finite(mi.Color1f(motion)).x
+    if job.tally is not None and s.drawn is not None:
+        job.tally.add(s.drawn, s.records.lane_of(), dr.max(dr.abs(s.value)) * motion)
+    return _splat(job, s, motion)
 
 
 def _accumulate_adjoint(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:

@@ -8,8 +8,6 @@ goes evenly to all pixels: what the pilot has missed costs at most 1/`EVEN_SHARE
 
 from __future__ import annotations
 
-import base64
-import zlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from .film import sampled_window
+from .levels import packed, unpacked
 from .low_discrepancy import LaneSampler, pixel_sampler
 from .upload import uploaded
 from .varying import varying
@@ -28,16 +27,13 @@ EVEN_SHARE = 0.25
 #: Noise, relative to the mean over the film, that pixels are believed to have on top: the pilot sees none in many.
 LEAST_NOISE = 0.02
 
-#: Resolution of wishes, and the level of the mean.
-STEPS_PER_OCTAVE, ZERO_LEVEL = 8, 64
-
 
 @dataclass(frozen=True)
 class FilmDensity:
     """Wishes for samples relative to the mean number, on the pixels of the crop window. Host object, plain text."""
 
     shape: tuple[int, int]  # (H, W)
-    levels: str  # logarithms of the wishes in steps of 1/`STEPS_PER_OCTAVE`, a byte each; compressed, in base64
+    levels: str  # the wishes, see `levels.packed`
 
     @staticmethod
     def of(variance: np.ndarray) -> FilmDensity | None:
@@ -45,17 +41,12 @@ class FilmDensity:
         spread = np.sqrt(_smoothed(np.asarray(variance, np.float64)))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
-        relative = spread / spread.mean() + LEAST_NOISE
-        levels = np.round(STEPS_PER_OCTAVE * np.log2(relative)) + ZERO_LEVEL
-        packed = zlib.compress(np.clip(levels, 0, 255).astype(np.uint8).tobytes())
-        return FilmDensity(tuple(spread.shape), base64.b64encode(packed).decode())
+        return FilmDensity(tuple(spread.shape), packed(spread / spread.mean() + LEAST_NOISE))
 
     @cached_property
     def relative(self) -> np.ndarray:
-        """(H, W), mean 1. Raises ValueError for a text that `of` has not written."""
-        levels = np.frombuffer(zlib.decompress(base64.b64decode(self.levels)), np.uint8).reshape(self.shape)
-        relative = 2.0 ** ((levels.astype(float) - ZERO_LEVEL) / STEPS_PER_OCTAVE)
-        return relative / relative.mean()
+        """(H, W), mean 1."""
+        return unpacked(self.levels, self.shape)
 
     def counts(self, film: mi.Film, spp: int) -> np.ndarray:
         """Samples of each pixel of the sampled window, (H, W) of integers ≥ 1, `spp` on average.

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.line_guide import LineGuide, LineTally
 from ..plan.job import Job
 from .film_noise import FilmNoise
 from .terms import TERMS
@@ -47,6 +48,7 @@ class TermNoise:
     p: float
     cost: float
     film: FilmNoise | None = None  # where it is noisy, if its samples are spread over the film
+    lines: LineGuide | None = None  # which lines through edges are worth it, if it samples any
 
     @staticmethod
     def between(few: float, more: float, cost: float) -> TermNoise:
@@ -59,6 +61,12 @@ class TermNoise:
         told = FilmNoise.of({FEW: few}, IMAGES).density
         gain = max(1.0, told.gain(more)) if told is not None else 1.0
         return replace(self, at_more=self.at_more / gain, film=FilmNoise.of({FEW: few, MORE: more}, IMAGES))
+
+    def guided(self, few: LineTally, more: LineTally) -> TermNoise:
+        """With lines as the pilot has found them worth; as much better as one half of it tells of the other."""
+        # c is f over the number of samples, and there are as many c²
+        lines, gain = LineGuide.between(few.moments, more.moments, (FEW / MORE) ** 2)
+        return replace(self, at_more=self.at_more / gain, lines=lines)
 
     def at(self, n: float) -> float:
         return self.at_more * (n / MORE) ** -self.p
@@ -125,12 +133,18 @@ def measure(
     for form in forms:
         found[form] = {}
         for term in (t for t in TERMS if t.name in names):
+            tallies = {spp: LineTally() if term.through_edges else None for spp in (FEW, MORE)}
             few, more = (
-                _variance([term.forward(job_of(form, FIRST_SEED + k, spp)) for k in range(IMAGES)])
-                for spp in (FEW, MORE)
-            )
+                _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally))
+                           for k in range(IMAGES)])
+                for spp, tally in tallies.items()
+            )  # fmt: skip
             noise = TermNoise.between(float(few.mean()), float(more.mean()), term.cost(form, sky))
-            found[form][term.name] = noise.spread(few, more) if term.over_film else noise
+            if term.over_film:
+                noise = noise.spread(few, more)
+            if term.through_edges:
+                noise = noise.guided(tallies[FEW], tallies[MORE])
+            found[form][term.name] = noise
     return Measurement(found)
 
 

@@ -14,7 +14,6 @@ import mitsuba as mi
 
 from ..core.counters import Counters
 from ..core.film import require_film
-from ..core.film_samples import FilmDensity
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..errors import OptionError, ZeroDerivativeWarning
@@ -25,7 +24,7 @@ from ..plan.form_choice import forms_to_try
 from ..plan.job import Job, tubes_of_call
 from ..plan.light_plan import plan_light
 from ..plan.motion import SceneMotion
-from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan
+from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
@@ -76,10 +75,11 @@ class _Question:
         """May budgets follow the measured noise?"""
         return self.call.options.plan == "lean" and not self.call.options.budgets_set
 
-    def job(self, plan: Plan, spp: int, density: FilmDensity | None = None) -> Job:
-        """The job of a term that gets `spp` paths per pixel, spread over the film as `density` wishes."""
+    def job(self, plan: Plan, spp: int, term: TermPlan | None = None) -> Job:
+        """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes."""
         tubes = tubes_of_call(self.call, self.facts, self.shared)
-        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp, density)
+        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp,
+                   *((term.film, term.lines) if term is not None else ()))  # fmt: skip
 
 
 def prepare(call: Call) -> Prepared:
@@ -100,14 +100,19 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t.film)) for t in plan.running], log)
+    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t)) for t in plan.running], log)
 
 
 def _spread(plan: Plan, measured: Measurement) -> Plan:
-    """The plan with samples where on the film noise was seen."""
+    """The plan with samples where on the film noise was seen, and of lines that brought something."""
     noise = measured.noise[plan.form]
     films = {name: n.film.density for name, n in noise.items() if n.film is not None}
-    return replace(plan, terms=tuple(replace(t, film=films.get(t.name)) if t.runs else t for t in plan.terms))
+    lines = {name: n.lines for name, n in noise.items()}
+
+    def spread(t: TermPlan) -> TermPlan:
+        return replace(t, film=films.get(t.name), lines=lines.get(t.name)) if t.runs else t
+
+    return replace(plan, terms=tuple(spread(t) for t in plan.terms))
 
 
 def _given(options: Options) -> Plan | None:
@@ -137,7 +142,7 @@ def _as_given(plan: Plan, q: _Question) -> Plan:
             "other parameters or another scene; make it anew with psdr_jit.make_plan"
         )
     budgets = {t.name: q.call.options.budget(t.budget) for t in TERMS}
-    off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0, "film": None}
+    off = {"runs": False, "reason": SWITCHED_OFF, "spp": 0, "streams": (), "segments": 0, "film": None, "lines": None}
     return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
 
 

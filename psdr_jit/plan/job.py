@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from ..core.film_samples import FilmDensity
+from ..core.line_guide import LineGuide, LineTally
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..options import Options
@@ -41,6 +42,8 @@ class Job:
     shared: Memory  # of all terms of one render call
     spp: int
     density: FilmDensity | None = None  # where on the film samples of this term are wanted; None: everywhere
+    guide: LineGuide | None = None  # which lines through edges are; None: all alike
+    tally: LineTally | None = None  # wants to know what lines bring
 
     @property
     def scene(self) -> mi.Scene:

@@ -9,10 +9,14 @@ and time.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from ..core.film_samples import FilmDensity
+from ..core.line_guide import LineGuide
 from ..errors import OptionError
 from ..options import FORMS
 from .light_plan import LightPlan
@@ -48,6 +52,7 @@ class TermPlan:
     segments: int  # expected path segments per pixel, 0 unless it runs
     edges: EdgeCount | None = None  # None: not a boundary term, or not counted
     film: FilmDensity | None = None  # where on the film its samples are; None: evenly, or they do not begin there
+    lines: LineGuide | None = None  # which lines through edges it prefers; None: none, or it has no such lines
 
 
 @dataclass(frozen=True)
@@ -81,7 +86,7 @@ class Plan:
             terms = tuple(_term_plan(term) for term in data.pop("terms"))
             light = data.pop("light", None)
             plan = Plan(terms=terms, light=None if light is None else LightPlan(**light), **data)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, zlib.error, TypeError, KeyError, AttributeError) as error:
             why = f"it has no {error}" if isinstance(error, KeyError) else error
             raise OptionError(f"plan = {_shortened(text)}: not a plan ({why}); write one with Plan.to_json") from error
         if plan.form not in FORMS:
@@ -104,12 +109,14 @@ class Plan:
 
 
 def _term_plan(data: dict) -> TermPlan:
-    edges, film = data.pop("edges"), data.pop("film", None)
+    edges, film, lines = data.pop("edges"), data.pop("film", None), data.pop("lines", None)
     edges = None if edges is None else EdgeCount(**edges)
     film = None if film is None else FilmDensity(tuple(film["shape"]), film["levels"])
-    if film is not None and film.relative.shape != film.shape:
-        raise ValueError("its samples have no place on the film")
-    term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=edges, film=film)
+    lines = None if lines is None else LineGuide(lines["levels"])
+    for table in (film and film.relative, lines and lines.density):
+        if table is not None and not np.isfinite(table).all():
+            raise ValueError("its samples have no place")
+    term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=edges, film=film, lines=lines)
     if not (isinstance(term.name, str) and isinstance(term.runs, bool) and type(term.spp) is int):
         raise TypeError("a term has a name, runs or not, and has a whole number of paths per pixel")
     if (term.spp > 0) != term.runs:

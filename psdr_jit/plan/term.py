@@ -45,4 +45,5 @@ class Term:
     forward: Callable[[Job], mi.TensorXf]
     backward: Callable[[Job, mi.TensorXf], None]
     edges: EdgeSampling | None = None
+    through_edges: bool = False  # its samples are lines through edges that can be guided
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy

@@ -98,7 +98,11 @@ class SampledRows:
 
     def sample_rows(self, count: int, jitter: mi.Float) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """`(row, t, pdf)` of `count` stratified samples, pdf times their number."""
-        row, t = self.rows.sample(self.state, stratified(count, jitter))
+        return self.rows_at(stratified(count, jitter), count)
+
+    def rows_at(self, x: mi.Float64, count: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        """The same for given numbers in [0, 1)."""
+        row, t = self.rows.sample(self.state, x)
         return row, t, self.rows.pdf(self.state, row, t) * varying(mi.Float, count)
 
 
