@@ -252,6 +252,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
             λ_o, λ_d = carry_adjoints(chain, steps.end.segment, λ_o, λ_d, job.motion)
             if job.facts.camera_moves:
+                dr.eval(λ_o, λ_d)  # stored, as in `interior.term`: a pose asks for each of them twelve times
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)
                     accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))

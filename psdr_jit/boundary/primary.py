@@ -16,7 +16,6 @@ The value of the estimator is 0, only its derivative is not. Both sides are trac
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,19 +23,21 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.ad import backpropagate, tangents
+from ..core.ad import accumulate, backpropagate, tangents
 from ..core.compaction import compact
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..edges.kind import Sight
+from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
 from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable, look_beside
 from ..options import Options
 from ..paths.walk import NoSink, skip_emitters, walk
 from ..plan.job import Job
+from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
@@ -74,6 +75,23 @@ class SeenEdge:
     sight: Sight
     view: View
     across: mi.Float  # length of edge seen per unit of its parameter, |dx/dt × ω| [m]
+    valid: mi.Bool
+
+
+@dataclass
+class Steps:
+    """Samples ready to be moved; detached, one entry each."""
+
+    at: EdgeLocation
+    ω: mi.Vector3f  # unit, from the sensor
+    n_perp: mi.Vector3f
+    turn: mi.Vector3f  # see `EdgeKind.turn`; 0 unless the camera moves
+    p: mi.Point2f  # film position [px]
+    film: mi.Point2f  # the same in [0, 1]² of the crop window
+    aperture: mi.Point2f
+    value: mi.Spectrum  # contribution per unit of motion
+    alpha: mi.Float  # the same of the coverage
+    wavelengths: mi.Color0f
     valid: mi.Bool
 
 
@@ -152,47 +170,80 @@ def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
     return L, alpha, wavelengths
 
 
-def _contribution(job: Job, finish: Callable[[mi.TensorXf], mi.TensorXf | None]) -> mi.TensorXf | None:
-    """`finish(image)`, the boundary as an image of value 0 that carries its derivative; None if there is nothing."""
-    with dr.suspend_grad():
-        edges = primary_edges(job)
-        if edges is None:
-            return None
-        sample = sample_visible(job, edges)
-        if sample is None:
-            return None
-        L, alpha, wavelengths = trace_sides(job, edges, sample)
-        even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
-        step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
-        ΔL = job.call.counters.rejected.keep_finite(step)
-        Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
-        wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
-        seen = seen_edge(job, edges, sample)
-        sight, view = seen.sight, seen.view
-        scale = seen.across / (view.J_px * sample.pdf)
-        turn = edges.table.turn(sight.at, view.ω, sight.n_perp)
-        if job.learns:
-            edges.rows.learn(edges.state, sample.row, sample.t, lambda: dr.max(dr.abs(ΔL)) * scale)
+def _steps(job: Job) -> tuple[PrimaryEdges, Steps] | None:
+    """Everything about the samples but how fast they move; None if there are none."""
+    edges = primary_edges(job)
+    if edges is None:
+        return None
+    sample = sample_visible(job, edges)
+    if sample is None:
+        return None
+    L, alpha, wavelengths = trace_sides(job, edges, sample)
+    even = 2 * dr.arange(mi.UInt32, dr.width(sample.row))
+    step = dr.gather(mi.Spectrum, L, even) - dr.gather(mi.Spectrum, L, even + 1)
+    ΔL = job.call.counters.rejected.keep_finite(step)
+    Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
+    wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
+    seen = seen_edge(job, edges, sample)
+    sight, view = seen.sight, seen.view
+    scale = seen.across / (view.J_px * sample.pdf)
+    if job.learns:
+        edges.rows.learn(edges.state, sample.row, sample.t, lambda: dr.max(dr.abs(ΔL)) * scale)
+    turn = edges.table.turn(sight.at, view.ω, sight.n_perp) if job.facts.camera_moves else mi.Vector3f(0)
+    return edges, Steps(
+        sight.at, view.ω, sight.n_perp, turn, view.p, view.film, sample.aperture,
+        ΔL * scale, Δα * scale, wavelengths, seen.valid,
+    )  # fmt: skip
 
-    with job.motion.attached() as moving:
-        relative = moving.of_edge(edges.table, sight.at, view.ω)
-        turned = mi.Float(0)
-        if job.facts.camera_moves:
-            relative -= moving.of_camera(view.film, sample.aperture, sight.at.x)
-            turned = dr.dot(turn, moving.of_view(view.film, sample.aperture, view.ω))
-        motion = (dr.dot(sight.n_perp, relative) + turned) * scale
-        return finish(films.develop_boundary(job.film, view.p, ΔL * motion, Δα * motion, wavelengths, seen.valid))
+
+def _motion(job: Job, edges: PrimaryEdges, steps: Steps, moving: Displacements) -> mi.Float:
+    """How fast the edges move across the film, attached; value 0."""
+    relative = moving.of_edge(edges.table, steps.at, steps.ω)
+    if not job.facts.camera_moves:
+        return dr.dot(steps.n_perp, relative)
+    relative -= moving.of_camera(steps.film, steps.aperture, steps.at.x)
+    return dr.dot(steps.n_perp, relative) + dr.dot(steps.turn, moving.of_view(steps.film, steps.aperture, steps.ω))
+
+
+def _splat(job: Job, steps: Steps, motion: mi.Float) -> mi.TensorXf:
+    return films.develop_boundary(
+        job.film, steps.p, steps.value * motion, steps.alpha * motion, steps.wavelengths, steps.valid
+    )
 
 
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the primary boundary along the tangents set on the scene's parameters. Detached."""
-    image = _contribution(job, tangents)
-    return films.black(job.film) if image is None else image
+    with dr.suspend_grad():
+        found = _steps(job)
+        if found is None:
+            return films.black(job.film)
+        edges, steps = found
+        with job.motion.attached() as moving:
+            motion = tangents(_motion(job, edges, steps, moving))
+        return _splat(job, steps, motion)
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the primary boundary's ⟨grad_in, dI⟩ into the attached parameters."""
-    _contribution(job, lambda image: backpropagate(image, grad_in))
+    with dr.suspend_grad():
+        found = _steps(job)
+        if found is None:
+            return
+        edges, steps = found
+        λ = _adjoint(job, steps, grad_in)
+        # Stored: each entry of a pose is a sum over all samples, in a kernel that would compute all this anew.
+        dr.eval(λ, steps)
+        with job.motion.attached() as moving:
+            accumulate(λ * _motion(job, edges, steps, moving))
+
+
+def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:
+    """Derivative of ⟨grad_in, image⟩ by the motion of every sample."""
+    with dr.resume_grad():
+        motion = dr.zeros(mi.Float, dr.width(steps.p))
+        dr.enable_grad(motion)
+        backpropagate(_splat(job, steps, motion), grad_in)
+        return dr.grad(motion)
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:

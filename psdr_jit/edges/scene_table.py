@@ -50,8 +50,8 @@ from .table import EdgeTable
 #: Of one render call: the table.
 TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
 
-#: Of an integrator: the arrays that straight edges were made from while every shape rests, and these edges.
-RESTING: Slot[tuple[list, EdgeSet] | None] = Slot(lambda: None)
+#: Of an integrator: the arrays that straight edges were made from last, which meshes could move, and these edges.
+STRAIGHT: Slot[tuple[list, list[bool], EdgeSet] | None] = Slot(lambda: None)
 
 #: Values along an axis of a grid from which the band along outlines, in which blended normals turn away, is narrow.
 FINE = 48
@@ -118,20 +118,23 @@ def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:
 
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
-    """Edges of the meshes; kept from call to call while every shape rests."""
+    """Edges of the meshes; kept from call to call while these stay as they are: views of one scene share them."""
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
+    moving = [s.moves for s in meshes]
     seams = [None if p is None else p.on_sides for p in patterns_of(job, meshes)]
-    if job.facts.shapes_move or balls or not job.plan.prunes:
-        return edge_set(shapes, [s.moves for s in meshes], job.call.memory, balls, seams)
-    buffers = [buffer for shape in shapes for buffer in mesh_buffers(shape)]
+    # what is recorded for other values must not hold the edges of these
+    recorded = job.facts.shapes_move and dr.flag(dr.JitFlag.FreezingScope)
+    if balls or recorded or not job.plan.prunes:
+        return edge_set(shapes, moving, job.call.memory, balls, seams)
+    buffers = [dr.detach(buffer) for shape in shapes for buffer in mesh_buffers(shape)]
     buffers += [on_sides for on_sides in seams if on_sides is not None]
-    known = job.call.memory[RESTING]
+    known = job.call.memory[STRAIGHT]
     # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
-    same = known is not None and [b.index for b in known[0]] == [b.index for b in buffers]
+    same = known is not None and known[1] == moving and [b.index for b in known[0]] == [b.index for b in buffers]
     if not same:
-        known = (buffers, edge_set(shapes, [False] * len(shapes), job.call.memory, seams=seams))
-        job.call.memory[RESTING] = known
-    return replace(known[1], meshes=tuple(shapes))
+        known = (buffers, moving, edge_set(shapes, moving, job.call.memory, seams=seams))
+        job.call.memory[STRAIGHT] = known
+    return replace(known[2], meshes=tuple(shapes))
 
 
 def _between_faces(

@@ -193,6 +193,7 @@ def backward(job: Job, found: LightTraced, flow: Flow, grad_in: mi.TensorXf) -> 
     films.clear(job.film)
     λ_o, λ_d = backward_sweep(found.records, δL, flow, job.motion)
     if job.facts.camera_moves:
+        dr.eval(λ_o, λ_d)  # stored, as in `term`: a pose asks for each of them twelve times
         with dr.resume_grad():
             ray = _camera_ray(job, found)
             accumulate(dr.dot(ray.o, λ_o) + dr.dot(ray.d, λ_d))

@@ -230,6 +230,8 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
             if job.facts.camera_moves:
                 λ_d = λ_d + _skipped(job, p, records) * λ_o
+                # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
+                dr.eval(λ_o, λ_d)
                 with dr.resume_grad():
                     adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
                     accumulate(adjoint)  # other terms need the sensor's edges

@@ -13,6 +13,9 @@ from psdr_jit.scene import io as scene_io
 
 WARM_UP, CALLS = 4, 12
 
+#: Operations of a kernel from which it follows paths, or does as much.
+WALK = 700
+
 
 @pytest.mark.parametrize("form", ["spatial", "material"])
 @pytest.mark.parametrize("mode", ["forward", "backward"])
@@ -60,3 +63,22 @@ def check(scene: mi.Scene, mode: str, form: str, motion: Perturbation) -> None:
             known |= found
     motion.restore()
     assert compiled[0] > 0 and not any(compiled[WARM_UP:]), compiled
+
+
+@pytest.mark.parametrize("budget", ["sppc", "sppp", "spps", "sppd", "sppi"])
+def test_a_pose_does_not_repeat_the_walk(llvm, budget):
+    """Each entry of a matrix is a sum of its own over all samples: what is summed must have been stored before."""
+    scene = scene_io.load_scene(scene_io.shipped_scene("glass.xml"), res=16)
+    params, param = mi.traverse(scene), "camera.to_world"
+    budgets = {**dict.fromkeys(("sppc", "sppp", "spps", "sppd", "sppi"), 0), budget: 8}
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, "form": "spatial", **budgets})
+    dr.enable_grad(params[param])
+    params.set_dirty(param)
+    params.update()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), seed=0, spp=0)
+        dr.sync_thread()
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["operation_count"] > WALK]
+    alike = [(k["size"], round(k["operation_count"], -2)) for k in kernels]
+    assert all(alike.count(which) < 6 for which in alike), sorted(alike)
