@@ -14,13 +14,24 @@ import numpy as np
 
 from ..core.film_samples import FilmDensity
 
+#: Rows and columns of what is kept, at most: it travels with the plan.
+MOST_CELLS = 256
+
 #: Least share of what was seen last: the scene changes as an optimisation goes on.
 FORGET = 0.2
 
 
+def coarse(image: np.ndarray) -> np.ndarray:
+    """Means of an image (H, W) over blocks of pixels, of which there are `MOST_CELLS` a side at most."""
+    rows, columns = (-(-n // MOST_CELLS) for n in image.shape)
+    margin = [(0, -image.shape[0] % rows), (0, -image.shape[1] % columns)]
+    padded = np.pad(image, margin, mode="edge")
+    return padded.reshape(padded.shape[0] // rows, rows, -1, columns).mean((1, 3))
+
+
 @dataclass(frozen=True, eq=False)
 class FilmNoise:
-    """What is known after some samples. Host object."""
+    """What is known after some samples, of pixels or blocks of them (`coarse`). Host object."""
 
     variance: np.ndarray  # (H, W), of one sample
     samples: float  # per pixel: how many have told

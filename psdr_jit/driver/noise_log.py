@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from .film_noise import FORGET
+from .film_noise import FORGET, coarse
 from .pilot import REFRESH, Measurement, variance_of_pair
 
 #: Pairs of images that are looked at in a row, and from then on one in so many calls.
@@ -76,7 +76,7 @@ class NoiseLog:
         for form, name, n, pixels in self.pending:
             if name not in self.current.noise[form]:
                 continue
-            variance = np.array(pixels, np.float64)
+            variance = coarse(np.array(pixels, np.float64))
             over_film.setdefault((form, name, n), []).append(variance)
             count = self.weighed[form, name] = self.weighed.get((form, name), 0) + 1
             self.current = self.current.observed(form, name, float(variance.mean()), n, max(FORGET, 1 / count))

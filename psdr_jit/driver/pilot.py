@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core.line_guide import LineGuide, LineTally
 from ..plan.job import Job
-from .film_noise import FilmNoise
+from .film_noise import FilmNoise, coarse
 from .terms import TERMS
 
 #: Independent images per term and sample count, and the paths per pixel of each.
@@ -154,7 +154,7 @@ def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.TensorXf:
 
 
 def _variance(images: list[mi.TensorXf]) -> np.ndarray:
-    """Of each pixel, (H, W), the mean over its channels: the variance between images."""
+    """Of each pixel or block of pixels, (H, W), the mean over its channels: the variance between images."""
     mean = sum(images[1:], images[0]) / len(images)
     spread = sum(dr.square(image - mean) for image in images) / (len(images) - 1)
-    return np.array(spread, np.float64).mean(-1)
+    return coarse(np.array(spread, np.float64).mean(-1))

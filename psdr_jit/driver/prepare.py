@@ -40,7 +40,7 @@ from .terms import TERMS
 MAY_BE_OUT = (SWITCHED_OFF, NO_EDGES)
 
 #: Why terms have their samples, and pixels theirs.
-BY_NOISE = "by measured noise, of terms and of pixels, as costly as equal ones"
+BY_NOISE = "by measured noise, of terms, pixels and lines, as costly as equal ones"
 
 #: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
 NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)

@@ -8,7 +8,7 @@ import pytest
 from helpers import adjoint_identity
 
 from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.driver.film_noise import FORGET, FilmNoise
+from psdr_jit.driver.film_noise import FORGET, FilmNoise, coarse
 from psdr_jit.scene import io as scene_io
 
 SHAPE = (4, 6)
@@ -26,6 +26,14 @@ def test_what_is_seen_with_a_density_is_put_back_to_one_sample():
     noise = FilmNoise(truth, 10)
     again = noise.seen(truth / (16 * noise.density.expected), 16, 3)
     assert np.allclose(again.variance, truth) and again.samples > noise.samples
+
+
+def test_large_films_are_kept_in_blocks():
+    image = np.add.outer(np.arange(600.0), np.zeros(100))
+    kept = coarse(image)
+    assert kept.shape == (200, 100) and np.allclose(kept[:, 0], 3 * np.arange(200) + 1)
+    assert coarse(image[:250]).shape == (250, 100)
+    assert coarse(image[:257]).shape == (129, 100)
 
 
 def test_old_observations_fade():

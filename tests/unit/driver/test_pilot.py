@@ -214,10 +214,10 @@ def test_every_pair_counts(llvm):
     """What was seen between two changes of the budgets weighs alike, not the last pair alone."""
     log = NoiseLog()
     log.pilot(noise(interior=(1.0, 1.0, 1.0)))
-    log.pending = [("spatial", "interior", pilot.MORE, mi.Float(v)) for v in (2.0, 4.0, 9.0)]
+    log.pending = [("spatial", "interior", pilot.MORE, mi.TensorXf([[v]])) for v in (2.0, 4.0, 9.0)]
     log.learn()
     assert log.current.noise["spatial"]["interior"].at_more == pytest.approx(5.0)
     log.pilot(noise(interior=(1.0, 1.0, 1.0)))
-    log.pending = [("spatial", "interior", pilot.MORE, mi.Float(2.0))]
+    log.pending = [("spatial", "interior", pilot.MORE, mi.TensorXf([[2.0]]))]
     log.learn()
     assert log.current.noise["spatial"]["interior"].at_more == pytest.approx(2.0)
