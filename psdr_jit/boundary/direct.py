@@ -26,6 +26,7 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.compaction import compact
+from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
@@ -38,6 +39,7 @@ from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
+from ..sampling.guided import guided
 from ..sampling.horizons import horizon_weights
 from ..sampling.light_steps import light_step_weights
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
@@ -66,9 +68,10 @@ class ShadowLine:
     row: mi.UInt32
     t: mi.Float
     light: LightLine
-    pdf_row: mi.Float  # of row and t, times the number of samples
+    pdf_row: mi.Float  # of row and t and by the guide, times the number of samples
     wavelengths: mi.Color0f
     weight: mi.Spectrum  # of the wavelengths
+    drawn: Drawn
 
 
 @dataclass
@@ -87,6 +90,7 @@ class BoundarySegment:
     value: mi.Spectrum  # −L_e |τ×ω|
     pdf: mi.Float  # of the line, times the number of samples
     wavelengths: mi.Color0f
+    drawn: Drawn
 
 
 def sample(job: Job, edges: SecondaryEdges) -> ShadowLine:
@@ -96,10 +100,12 @@ def sample(job: Job, edges: SecondaryEdges) -> ShadowLine:
         count *= LINES_PER_PATH_UNDER_SKY
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.DIRECT_EDGE), lane)
-    row, t, pdf_row = edges.sample_rows(count, rng.next_1d())
+    jitter = rng.next_1d()
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    light = sample_light_lines(job.scene, edges, row, t, wavelengths, rng.next_2d())
-    return ShadowLine(lane, row, t, light, pdf_row, wavelengths, weight)
+    x, u, drawn = guided(job, count, jitter, rng.next_2d())
+    row, t, pdf_row = edges.rows_at(x, count)
+    light = sample_light_lines(job.scene, edges, row, t, wavelengths, u)
+    return ShadowLine(lane, row, t, light, pdf_row * drawn.p, wavelengths, weight, drawn)
 
 
 def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment | None:
@@ -138,6 +144,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
         value=-light.value * line.weight * light.across,
         pdf=light.pdf * line.pdf_row,
         wavelengths=line.wavelengths,
+        drawn=line.drawn,
     )
     return compact(segment, active)
 
@@ -156,6 +163,7 @@ def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> Bound
         records=records,
         value=records.left_by_smooth_lobes(records.data.W),
         source_motion=lambda moving: source_motion(job, segment, moving),
+        drawn=segment.drawn,
     )
 
 
@@ -243,4 +251,5 @@ TERM = Term(
         lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job) + horizon_weights(job, NAME, direct=True),
         "no light sees the others as an outline, or they are coplanar",
     ),
+    through_edges=True,
 )

@@ -12,22 +12,18 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compaction import compact
-from ..core.line_guide import Drawn, GuideTables, LineGuide, evenly
+from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
-from ..core.memory import Slot
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.kind import Line, Sight
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
 from ..plan.job import Job
-from ..sampling.distribution import stratified
+from ..sampling.guided import guided
 from ..sampling.relevance import SecondaryEdges
 from ..sampling.rows import edge_samples
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, recorded_vertices
-
-#: Of one render call: tables of guides.
-GUIDES: Slot[dict[LineGuide, GuideTables]] = Slot(dict)
 
 
 @dataclass
@@ -65,25 +61,15 @@ def sample_lines(job: Job, edges: SecondaryEdges) -> EdgeLine:
     count = edge_samples(job, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_EDGE), lane)
-    x = stratified(count, rng.next_1d())
+    jitter = rng.next_1d()
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    x, u, drawn = _guided(job, x, rng.next_2d())
+    x, u, drawn = guided(job, count, jitter, rng.next_2d())
     row, t, pdf_row = edges.rows_at(x, count)
     views = edges.views(row)
     through = edges.table.ask(row, lambda kind, own_row, active: kind.line(own_row, t, u, views, active))
     n_perp, across = through.on.across(through.ω)
     valid = through.on.valid & (across > 0) & (through.pdf_sa > 0)
     return EdgeLine(lane, row, t, through, n_perp, across, pdf_row * drawn.p, wavelengths, weight, drawn, valid)
-
-
-def _guided(job: Job, x: mi.Float64, u: mi.Point2f) -> tuple[mi.Float64, mi.Point2f, Drawn]:
-    """The numbers that choose lines, as the job's guide prefers them."""
-    if job.guide is None:
-        return x, u, evenly(x, u)
-    tables = job.shared[GUIDES]
-    if job.guide not in tables:
-        tables[job.guide] = job.guide.tables()
-    return tables[job.guide].draw(x, u)
 
 
 def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:

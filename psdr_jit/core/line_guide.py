@@ -32,7 +32,7 @@ SHAPE = (GROUPS, BINS, BINS)
 EVEN_SHARES = (0.2, 0.5)
 
 #: Factor between second moments from which a guide is worth having.
-LEAST_GAIN = 1.3
+LEAST_GAIN = 1.5
 
 
 @dataclass
