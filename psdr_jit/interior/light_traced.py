@@ -121,6 +121,7 @@ def turn_around(
         o = mi.Point3f(si.spawn_ray_to(following.x).o)  # off the surface: a sphere is met again from its inside
         ω = _met_from(o, following).d  # as the record of the next vertex has it
         F = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ω), active & ~last)
+        sound &= last | _differentiable(si, ω, limits)
         p = average(F)
         p = dr.select(last, 0, dr.select(p > 0, p, 1))
 
@@ -134,6 +135,13 @@ def turn_around(
         k += 1
         active = k < n
     return sound
+
+
+def _differentiable(si: mi.SurfaceInteraction3f, ω: mi.Vector3f, limits: PathLimits) -> mi.Bool:
+    """Can one tell on which side of the critical angle the turn towards ω is?"""
+    if limits.critical is None:
+        return mi.Bool(True)
+    return ~limits.critical.blurred(si.bsdf(), si.wi, si.to_local(ω))
 
 
 def _emitter_sample(

@@ -34,8 +34,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, pixel_footprint
+from .critical_angle import CriticalAngle
 from .light_source import LightSources
-from .scattering import Scattering, reverse_pdf
+from .scattering import Mixture, Scattering, reverse_pdf
 
 #: Fewest surface vertices of a path that light subpaths find: the sensor's own view of a rough surface needs no help.
 SHORTEST = 2
@@ -64,6 +65,12 @@ class LightTechnique:
     ratio: mi.Float  # n_L/n_E: light subpaths for each camera sample of a pixel
     longest: int  # surface vertices of a light subpath, at most
     exclusive: bool  # what light subpaths find is left to them
+    critical: CriticalAngle | None = None  # of light subpaths as well, see `PathLimits`
+
+    @property
+    def mixture(self) -> Mixture:
+        """How light subpaths sample directions."""
+        return Mixture(critical=self.critical)
 
     def start(self) -> Trail:
         return Trail(mi.Float(self.ratio), mi.Bool(False))
@@ -87,7 +94,7 @@ class LightTechnique:
         n = dr.select(ds.delta, 0, ds.n)
         E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, ds.emitter), ds.p, n, si.p, found)
         found &= E > 0
-        h = reverse_pdf(mi.BSDFContext(), si, bsdf, ω, 0.0, found) * cosine_ratio(si, ω)
+        h = reverse_pdf(mi.BSDFContext(), si, bsdf, ω, self.mixture, found) * cosine_ratio(si, ω)
         return self._shared(mis, dr.select(found, trail.q * h / ds.pdf * E, 0))
 
     def carry_on(
@@ -97,7 +104,7 @@ class LightTechnique:
         found = active & ~onward.delta & (trail.q > 0) & (onward.pdf > 0) & (k < self.longest)
         first = k == 0
         view = pixel_footprint(self.frame, si.p, -si.to_world(si.wi))
-        turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, 0.0, found & ~first)
+        turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, self.mixture, found & ~first)
         q = trail.q * dr.select(first, view, turned) * cosine_ratio(si, onward.wo) / onward.pdf
         return Trail(dr.select(found, q, 0), focuses(bsdf))
 

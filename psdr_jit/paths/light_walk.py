@@ -32,7 +32,7 @@ from .bounce import PathLimits, PathState, bounce
 from .light_source import LightStart
 from .light_technique import SHORTEST, LightTechnique, average, cosine_ratio, focuses
 from .rays import interaction
-from .scattering import mixture_pdf
+from .scattering import Mixture, mixture_pdf
 from .sensor_connection import on_film, seen_by_sensor
 
 #: Share of what is black in the probability of being kept, where the derivative of what is black is wanted.
@@ -127,12 +127,12 @@ class _Turn:
     step: mi.Float  # c^-/c^+
 
     @staticmethod
-    def towards(wo: mi.Vector3f, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, share: float, active) -> _Turn:
-        """`wo`: local. `share`: of uniform directions, of the camera's paths."""
+    def towards(wo: mi.Vector3f, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, mixture: Mixture, active) -> _Turn:
+        """`wo`: local. `mixture`: of the camera's paths."""
         turned = mi.SurfaceInteraction3f(si)
         turned.wi = mi.Vector3f(wo)
         F, p = bsdf.eval_pdf(mi.BSDFContext(), turned, si.wi, active)
-        return _Turn(F, mixture_pdf(turned, bsdf, si.wi, p, share), cosine_ratio(si, wo))
+        return _Turn(F, mixture_pdf(turned, bsdf, si.wi, p, mixture), cosine_ratio(si, wo))
 
 
 def _first_segment(
@@ -164,7 +164,7 @@ def _connected(
     view = look_at(technique.frame, si.p, aperture)
     bsdf = si.bsdf()
     seen = active & on_film(technique.frame, view) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    turn = _Turn.towards(si.to_local(-view.ω), si, bsdf, limits.uniform_share, seen)
+    turn = _Turn.towards(si.to_local(-view.ω), si, bsdf, limits.mixture, seen)
     end = turn.step / view.J_px
     U = carried.U * turn.p * end / technique.ratio
     w = mi.Float(1) if technique.exclusive else dr.rcp(1 + dr.square(U))
@@ -191,7 +191,7 @@ def trace_light(
     `limits`: of the camera's paths, with their `light`.
     """
     technique = limits.light
-    own = replace(limits, uniform_share=0.0, light=None)
+    own = replace(limits, uniform_share=0.0, critical=technique.critical, light=None)
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     ray = mi.Ray3f(start.ray)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=True)
@@ -213,7 +213,7 @@ def trace_light(
 
         onward = bounce(si, bsdf, sampler, path, own, ctx, active & (~first | focuses(bsdf)))
         alive = onward.alive & ~onward.scattering.delta & (s < technique.longest)
-        turn = _Turn.towards(onward.scattering.wo, si, bsdf, limits.uniform_share, alive)
+        turn = _Turn.towards(onward.scattering.wo, si, bsdf, limits.mixture, alive)
         step = turn.step / onward.scattering.pdf
         p = dr.select(first, _root(start, turn.p, pdf_em), turn.p)
         carried = dr.select(
