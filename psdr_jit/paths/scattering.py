@@ -90,6 +90,15 @@ def _two_delta_lobes(bsdf: mi.BSDFPtr) -> mi.Bool:
     return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) & through
 
 
+def delta_probability(bsdf: mi.BSDFPtr, alone: mi.Float, mixture: Mixture) -> mi.Float:
+    """Probability with which `sample_scattering` takes a delta lobe that the BSDF `alone` takes with that one.
+
+    Where one of two lobes is not there, such as in total reflection, every choice leads to the other one.
+    """
+    share = mixture.uniform
+    return dr.select(_two_delta_lobes(bsdf) & (alone < 1), share / 2 + (1 - share) * alone, alone)
+
+
 def _refused(weight: mi.Spectrum, f: mi.Spectrum) -> mi.Bool:
     """Samples that a BSDF sent back with weight 0 though it is not 0 there.
 
@@ -149,8 +158,7 @@ def sample_scattering(
     found &= pdf > 0
     if mixture.critical is not None:
         found &= ~mixture.critical.blurred(bsdf, si.wi, wo)
-    # Where one of the lobes is not there, such as in total reflection, every choice leads to the other one.
-    chosen = dr.select(two_lobes & (bs.pdf < 1), share / 2 + (1 - share) * bs.pdf, bs.pdf)
+    chosen = delta_probability(bsdf, bs.pdf, mixture)
     of_delta = dr.select(chosen > 0, weight * (bs.pdf / chosen), 0)
     weight = dr.select(delta, of_delta, dr.select(found, f / pdf, 0))
     η = dr.select(uniform | critical, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
+from ..core.film import filter_reach
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
+from ..core.varying import varying
 from ..options import Options
 from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.light_technique import LightTechnique
@@ -107,7 +109,10 @@ class Job:
 
     def _light_technique(self) -> LightTechnique | None:
         plan = self.plan
-        return light_technique(self.scene, self.facts, self.frame, self.options, plan.light, plan.prunes)
+        technique = light_technique(self.scene, self.facts, self.frame, self.options, plan.light, plan.prunes)
+        if technique is None or not technique.delta_lobes:
+            return technique
+        return replace(technique, margin=varying(mi.Float, filter_reach(self.film)))
 
     @property
     def limits(self) -> PathLimits:
