@@ -15,8 +15,8 @@ make it, and no Jacobian of the chain is needed. The price is that h is smooth; 
 As y_1 stays, the outline of a body as the light sees it is no discontinuity: E cosθ_1 goes to 0 there, and a sheet
 keeps its edge. The camera moves as if everything else moved the other way.
 
-Not in here: that something else comes between the light and y_1, that a later vertex goes past an edge, or that y_s is
-hidden from the camera. `record` warns of that.
+Not in here: that something else comes between the light and y_1, that a later vertex goes past an edge, and that y_s
+goes behind something that hides it from the camera, moving or not. `record` warns of that.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def record(
         warn_once(
             "light of points by way of mirrors and smooth glass has no boundary terms: its derivative is right where "
             "nothing comes between the light and the first surface, the light passes no edges from there on, and "
-            "nothing moves in front of what it shines on",
+            "nothing hides a part of what it shines on from the camera",
             UnsupportedWarning,
             job.call.memory,
         )
