@@ -198,7 +198,7 @@ def _forward_sweep(found: LightBorne, o_grad: mi.Vector3f, d_grad: mi.Vector3f, 
             dr.set_grad(d, d_grad)
             t = _terms(found, k, mi.Ray3f(o, d, 0, found.wavelengths), moving, active)
             w_grad, x_grad, onward_grad, film_grad = tangents(t.w, t.x, t.d, t.p)
-        rate += w_grad
+        rate = mi.Spectrum(rate + w_grad)
         o_grad = mi.Vector3f(x_grad)
         d_grad = mi.Vector3f(onward_grad)
         p_grad = mi.Vector2f(film_grad)

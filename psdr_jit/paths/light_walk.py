@@ -14,6 +14,9 @@ geometric ones, the cosines are Veach's correction for particles. The inverse of
 
 with √(p_s² + p_em²) for p_s, so that both other techniques are in it.
 
+At a delta lobe, F_k is its value, p_k and p̃_k are probabilities, and étendue puts (η_k^+/η_k^-)² in place of the
+cosines. What a delta light sends through such a lobe first of all has w_L = 1: nothing else finds it (`alone`).
+
 One connection of each subpath is kept, with a probability proportional to what it brings, and stands for all (weighted
 reservoir sampling; in expectation nothing changes). So a subpath costs one record, however long. Detached throughout.
 """

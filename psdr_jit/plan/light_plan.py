@@ -1,7 +1,8 @@
 """Do light subpaths run, and why: where small lights shine on surfaces that may focus them, and nowhere else.
 
-What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that scatter
-near the mirrored or bent direction (`paths.light_technique.focuses`), and a scene without any is left to camera paths.
+What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that
+scatter in or near the mirrored or bent direction (`paths.light_technique.focuses`); a scene without any is left to
+camera paths.
 """
 
 from __future__ import annotations

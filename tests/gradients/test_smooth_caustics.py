@@ -164,7 +164,7 @@ def test_same_flow_however_found(llvm, param):
     ("spot", "lamp.to_world"), ("spot", "ball.bsdf.eta"), ("card", "ball.to_world"),
     pytest.param("spot", "camera.to_world", marks=SLOW), pytest.param("point", "ball.to_world", marks=SLOW),
 ])  # fmt: skip
-def test_forward_and_backward_are_transposes(llvm, light, param):
+def test_forward_and_backward_are_transposes(variant, light, param):
     integrator = integrator_specs.build(bdpt(**INTERIOR, sppc=8))
     wJv, JTwv, w, Jv = adjoint_identity(glass_ball(light), param, integrator)
     assert Jv > 1e-6
