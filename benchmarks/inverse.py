@@ -79,6 +79,7 @@ CAMERA, LAMP, BLOCKER = "camera.to_world", "lamp.position", "blocker.vertex_posi
 BOX, BALL, IOR = "box.vertex_positions", "ball.to_world", "ball.bsdf.eta"
 CAMERA_SIZE = 4.3  # [units] from the camera to the middle of the boxes
 SHADOW_SIZE = 3.0  # [units] from the lamp to the floor
+SPOT, CAUSTIC_SIZE = "lamp.to_world", 3.3  # [units] from the spotlight to the floor
 MIRROR_SIZE = 3.0  # [units] from the mirror to the end of what it shows
 
 EXAMPLES = {
@@ -106,6 +107,11 @@ EXAMPLES = {
         "glass",
         named(ior=offset(IOR, "rms"), distance=offset(BALL, "distance")),
         {"ior": below(0.01), "distance": below(0.01)},
+    ),
+    "caustic": Example(
+        "caustic",
+        named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
+        {"ior": below(0.01), "spot": below(0.01)},
     ),
 }
 

@@ -24,8 +24,9 @@ class BidirectionalIntegrator(TermIntegrator):
          (Default: auto)
 
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small
-    sources send through rough glass, or by way of rough mirrors, has less noise. Each camera sample comes with two
-    light subpaths. What light subpaths alone could find, point and spot lights through smooth glass, is not shown.
+    sources send through glass, or by way of mirrors, has less noise. Each camera sample comes with two light subpaths.
+    Light of points and spots through smooth glass and by way of smooth mirrors, which camera paths never find, is in
+    the image as well; its derivative needs a smooth reconstruction filter, and has no boundary terms.
     """
 
     bidirectional = True

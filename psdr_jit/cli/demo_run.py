@@ -112,7 +112,7 @@ def recover_pose(scene: Any, integrator: Any = None, iterations: int = 60, spp: 
                  progress: Callable[[int, int, Recovery], None] | None = None) -> Recovery:
     """Displace the box by `START`, then bring it back by descending the image loss; the scene is left as it was."""
     spec = integrator_specs.integrator_spec(scene, integrator)
-    differentiable, plain = integrator_specs.build(spec), integrator_specs.reference(spec)
+    differentiable, plain = integrator_specs.build(spec), integrator_specs.reference(spec, scene)
     params = mi.traverse(scene)
     params.keep(PARAMETER)
     original = mi.Float(dr.detach(params[PARAMETER]))

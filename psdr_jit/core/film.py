@@ -136,6 +136,28 @@ def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> m
     return image / _pixel_mass(film)
 
 
+def develop_splats(film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, active: mi.Bool) -> mi.TensorXf:
+    """Image of light that lands on the film at `pos` [px], in the window of camera samples or not.
+
+    Σ f(pos − pixel) · value / ∫ f, attached where `pos` and `value` are. Of a box filter, `pos` has no derivative.
+    """
+    clear(film)
+    block = film.create_block()
+    block.set_coalesce(False)
+    _put(block, film, pos, value, mi.Float(0), mi.Float(0), wavelengths, active)
+    film.put_block(block)
+    image = film.develop()
+    rfilter = film.rfilter()
+    if rfilter.is_box_filter():
+        return image
+    return image / float(_filter_mass(rfilter, 0, 1, (-np.inf, np.inf))[0] ** 2)
+
+
+def filter_reach(film: mi.Film) -> float:
+    """Distance from a pixel's centre to which its filter reaches, 0 for a box filter [px]."""
+    return 0.0 if film.rfilter().is_box_filter() else float(film.rfilter().radius())
+
+
 def black(film: mi.Film) -> mi.TensorXf:
     """An image of zeros in the film's format."""
     clear(film)

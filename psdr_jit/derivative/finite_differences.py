@@ -64,7 +64,7 @@ class CentralDifference:
         self.scene = perturbation.scene
         pad_curves(self.scene)
         self.sensor = self.scene.sensors()[sensor]
-        self.integrator = integrator_specs.reference(spec)
+        self.integrator = integrator_specs.reference(spec, self.scene)
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
         require_samples(self.sensor, self.spp)

@@ -18,6 +18,7 @@ from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
 from psdr_jit.options import FOLLOWS
 from psdr_jit.plan.plan import Plan
+from psdr_jit.scene.facts import analyse
 
 DEFAULT_INTEGRATOR = "psdr_path"
 
@@ -106,9 +107,17 @@ def build_term(spec: Mapping[str, Any], term: str) -> Any:
     return build({**spec, **budgets})
 
 
-def reference(spec: Mapping[str, Any]) -> Any:
-    """Mitsuba's `path` with the path options of `spec`: what finite differences are taken of."""
-    return build({"type": "path", **{k: spec[k] for k in PATH_OPTIONS if k in spec}})
+def reference(spec: Mapping[str, Any], scene: Any) -> Any:
+    """What finite differences are taken of: Mitsuba's `path` with the path options of `spec`.
+
+    Where `psdr_bdpt` shows what `path` does not, light of points by way of mirrors and smooth glass: `psdr_bdpt`.
+    """
+    options = {k: spec[k] for k in PATH_OPTIONS if k in spec}
+    if spec.get("type") == "psdr_bdpt" and spec.get("light_paths") != "off":
+        facts = analyse(scene)
+        if facts.has_delta_emitters and facts.has_delta_lobes:
+            return build({"type": "psdr_bdpt", **options})
+    return build({"type": "path", **options})
 
 
 def rejected(integrator: Any) -> int | None:

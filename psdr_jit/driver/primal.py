@@ -1,6 +1,7 @@
 """The image itself where light subpaths help: camera paths with their share of the weights, and what light brings.
 
-Equal in expectation to Mitsuba's `path`: every path that light subpaths find, camera paths could have found.
+Equal in expectation to Mitsuba's `path`, but for light of points by way of mirrors and smooth glass, which camera paths
+cannot find.
 """
 
 from __future__ import annotations
@@ -68,4 +69,8 @@ def _from_light(job: Job, p: CameraPass, limits: PathLimits) -> mi.TensorXf:
     start = limits.light.sources.sample(rng, wavelengths)
     path = trace_light(job.scene, rng, start, limits, job.options.hide_emitters)
     value = job.call.counters.rejected.keep_finite(path.value * weight / varying(mi.Float, lanes))
-    return films.develop_boundary(job.film, path.p, value, mi.Float(0), wavelengths, path.count > 0)
+    found = path.count > 0
+    if not limits.light.delta_lobes:
+        return films.develop_boundary(job.film, path.p, value, mi.Float(0), wavelengths, found)
+    shared = films.develop_boundary(job.film, path.p, value, mi.Float(0), wavelengths, found & ~path.alone)
+    return shared + films.develop_splats(job.film, path.p, value, wavelengths, found & path.alone)

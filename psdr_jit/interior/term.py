@@ -115,6 +115,9 @@ def _limits(job: Job) -> PathLimits:
     material = any(s.material for s in facts.shapes)
     rough_glass = any(s.bsdf_flags & int(mi.BSDFFlags.GlossyTransmission) for s in facts.shapes)
     limits = replace(job.limits, end_black=not material, refuses=material and rough_glass, light=job.light)
+    if job.critical is not None:
+        light = None if job.light is None else replace(job.light, critical=job.critical.of_light())
+        limits = replace(limits, critical=job.critical, light=light)
     return replace(limits, uniform_share=UNIFORM_SHARE) if facts.geometry_moves else limits
 
 

@@ -17,8 +17,9 @@ import mitsuba as mi
 
 from ..core.records import Continuation
 from ..scene.tubes import Tubes
+from .critical_angle import CriticalAngle
 from .light_technique import LightTechnique
-from .scattering import Scattering, accepted, mixture_pdf, sample_scattering
+from .scattering import Mixture, Scattering, accepted, mixture_pdf, sample_scattering
 
 #: Largest probability with which the roulette lets a path live, as in Mitsuba's `path`.
 MOST_SURVIVAL = 0.95
@@ -32,10 +33,16 @@ class PathLimits:
     rr_depth: int
     end_black: bool = True  # a throughput of 0 ends the path; not if its derivative is wanted
     uniform_share: float = 0.0  # of the directions, see `scattering`
+    critical: CriticalAngle | None = None  # glass whose index is differentiated, see `critical_angle`
     refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
     tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
     light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
+
+    @property
+    def mixture(self) -> Mixture:
+        """How directions are sampled."""
+        return Mixture(self.uniform_share, self.critical)
 
     def beyond(self, k: mi.UInt32) -> PathLimits:
         """Limits of paths that have `k` segments behind them already, lane by lane."""
@@ -79,7 +86,7 @@ def bounce(
 ) -> Bounce:
     """Go on from `si` in the transport mode of `ctx`."""
     u_lobe, u = sampler.next_1d(), sampler.next_2d()
-    s = sample_scattering(ctx, si, bsdf, u_lobe, u, limits.uniform_share, limits.refuses, active)
+    s = sample_scattering(ctx, si, bsdf, u_lobe, u, limits.mixture, limits.refuses, active)
     if ctx.mode == mi.TransportMode.Importance:
         s.weight = s.weight * particle_correction(si, si.to_world(s.wo))
     return _after_roulette(s, sampler, path, limits, active)
@@ -95,10 +102,10 @@ def evaluate_and_bounce(
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, Bounce]:
     """`bounce` of radiance, and the BSDF in a given local direction `wo`: `(f cosθ, pdf, Bounce)`."""
-    ctx, share = mi.BSDFContext(), limits.uniform_share
-    if share != 0:
+    ctx, mixture = mi.BSDFContext(), limits.mixture
+    if not mixture.plain:
         f, pdf = bsdf.eval_pdf(ctx, si, wo, active)
-        return f, mixture_pdf(si, bsdf, wo, pdf, share), bounce(si, bsdf, sampler, path, limits, ctx, active)
+        return f, mixture_pdf(si, bsdf, wo, pdf, mixture), bounce(si, bsdf, sampler, path, limits, ctx, active)
     u_lobe, u = sampler.next_1d(), sampler.next_2d()
     f, pdf, bs, weight = bsdf.eval_pdf_sample(ctx, si, wo, u_lobe, u, active)  # in one virtual call
     s = accepted(ctx, si, bsdf, bs, weight, limits.refuses, active)

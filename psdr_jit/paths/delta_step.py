@@ -33,6 +33,7 @@ class DeltaStep:
     d: mi.Vector3f  # unit, world space
     value: mi.Spectrum  # of the lobe: what its weight is worth times the probability of choosing it
     η: mi.Float  # relative refractive index along the direction
+    probability: mi.Float  # with which the BSDF chooses the lobe
 
 
 def delta_step(
@@ -47,4 +48,4 @@ def delta_step(
     bs, weight = bsdf.sample(ctx, si, dr.select(through, LAST_LOBE, FIRST_LOBE), mi.Point2f(0.5), active)
     null = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     value = dr.select(null, bsdf.eval_null_transmission(si, null), weight * bs.pdf)
-    return DeltaStep(dr.replace_grad(onward, si.to_world(bs.wo)), value, bs.eta)
+    return DeltaStep(dr.replace_grad(onward, si.to_world(bs.wo)), value, bs.eta, dr.detach(bs.pdf))

@@ -2,7 +2,7 @@
 
 A path x_1 … x_s from the sensor, with light from y_0, can be found by next-event estimation at x_s (N), by scattering
 that meets the light (B), and by a light subpath y_0, x_s, …, x_1 whose end is connected to the sensor (L). Only what
-light subpaths are meant for is asked of them: x_s focuses (`focuses`), s ≥ 2, and no vertex is left by a delta lobe.
+light subpaths are meant for is asked of them: x_s focuses (`focuses`), s ≥ 2, and x_1 is not left by a delta lobe.
 
 *Densities.* Write p_k for the density of the direction x_k → x_{k+1} by which the camera's path goes on (x_{s+1} = y_0)
 and p̃_k for that of x_k → x_{k−1} by which the light's does, per solid angle; c_k^+ and c_k^− for the cosines between
@@ -22,6 +22,13 @@ carried along the camera's path (`Trail`); along the light's, its inverse is (`l
 functions of the same path, which is all that the weights of multiple importance sampling have to satisfy. The roulette
 enters estimates, not weights.
 
+At a delta lobe densities are probabilities P_k, P̃_k times delta functions of directions that are mapped to each other.
+The étendue η² c dω does not change on the way, η_k^± the refractive indices on both sides, which leaves
+
+    h_k/p_k = (P̃_k/P_k) (η_k^-/η_k^+)²
+
+there. N cannot find what x_s does by such a lobe, and of a point or spot light neither can B: that is left to L.
+
 *Weights* are those of the power heuristic, w_i = p_i² / Σ_j p_j² [Veach 1997, §9.2.4]. Two of the three are known from
 the walk already, 1/w = 1 + (p_j/p_i)²; the third adds (p_L/p_i)².
 """
@@ -34,17 +41,26 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, pixel_footprint
+from .critical_angle import CriticalAngle
+from .delta_step import delta_step
 from .light_source import LightSources
-from .scattering import Scattering, reverse_pdf
+from .scattering import Mixture, Scattering, delta_probability, reverse_pdf
 
 #: Fewest surface vertices of a path that light subpaths find: the sensor's own view of a rough surface needs no help.
 SHORTEST = 2
 
 
+#: Lobes that keep near the mirrored or bent direction, or in it.
+FOCUSING = ("Glossy", "DeltaReflection", "DeltaTransmission")
+
+
 def focuses(bsdf: mi.BSDFPtr) -> mi.Bool:
     """May the surface gather light on others: does all that it scatters keep near the mirrored or bent direction?"""
-    flags, glossy, diffuse = bsdf.flags(), mi.BSDFFlags.Glossy, mi.BSDFFlags.Diffuse
-    return mi.has_flag(flags, glossy) & ~mi.has_flag(flags, diffuse)
+    flags = bsdf.flags()
+    focusing = mi.Bool(False)
+    for lobe in FOCUSING:
+        focusing |= mi.has_flag(flags, getattr(mi.BSDFFlags, lobe))
+    return focusing & ~mi.has_flag(flags, mi.BSDFFlags.Diffuse)
 
 
 @dataclass
@@ -64,6 +80,14 @@ class LightTechnique:
     ratio: mi.Float  # n_L/n_E: light subpaths for each camera sample of a pixel
     longest: int  # surface vertices of a light subpath, at most
     exclusive: bool  # what light subpaths find is left to them
+    delta_lobes: bool = False  # the scene has some
+    margin: mi.Float | float = 0.0  # around the film in which light that nothing else finds counts as well [px]
+    critical: CriticalAngle | None = None  # of light subpaths as well, see `PathLimits`
+
+    @property
+    def mixture(self) -> Mixture:
+        """How light subpaths sample directions."""
+        return Mixture(critical=self.critical)
 
     def start(self) -> Trail:
         return Trail(mi.Float(self.ratio), mi.Bool(False))
@@ -87,19 +111,31 @@ class LightTechnique:
         n = dr.select(ds.delta, 0, ds.n)
         E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, ds.emitter), ds.p, n, si.p, found)
         found &= E > 0
-        h = reverse_pdf(mi.BSDFContext(), si, bsdf, ω, 0.0, found) * cosine_ratio(si, ω)
+        h = reverse_pdf(mi.BSDFContext(), si, bsdf, ω, self.mixture, found) * cosine_ratio(si, ω)
         return self._shared(mis, dr.select(found, trail.q * h / ds.pdf * E, 0))
 
     def carry_on(
         self, trail: Trail, k: mi.UInt32, si, bsdf: mi.BSDFPtr, onward: Scattering, active: mi.Bool
     ) -> Trail:
         """The trail behind `si`, the vertex number `k`, which the path leaves by `onward`."""
-        found = active & ~onward.delta & (trail.q > 0) & (onward.pdf > 0) & (k < self.longest)
         first = k == 0
+        found = active & (trail.q > 0) & (onward.pdf > 0) & (k < self.longest) & ~(onward.delta & first)
         view = pixel_footprint(self.frame, si.p, -si.to_world(si.wi))
-        turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, 0.0, found & ~first)
+        turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, self.mixture, found & ~first & ~onward.delta)
         q = trail.q * dr.select(first, view, turned) * cosine_ratio(si, onward.wo) / onward.pdf
+        if self.delta_lobes:
+            delta = found & onward.delta
+            P = self._delta_reverse(si, bsdf, onward.wo, delta)
+            q = dr.select(delta, trail.q * P / (onward.pdf * dr.square(onward.η)), q)
         return Trail(dr.select(found, q, 0), focuses(bsdf))
+
+    def _delta_reverse(self, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Probability P̃ with which a light subpath that arrives from `wo` (local) takes the delta lobe to `si.wi`."""
+        turned = mi.SurfaceInteraction3f(si)
+        turned.wi = mi.Vector3f(wo)
+        ctx = mi.BSDFContext(mi.TransportMode.Importance)
+        back = delta_step(ctx, turned, bsdf, si.to_world(si.wi), active)
+        return delta_probability(bsdf, back.probability, self.mixture)
 
     def _finds(self, s: mi.UInt32) -> mi.Bool:
         """By the number of surface vertices."""

@@ -14,6 +14,9 @@ geometric ones, the cosines are Veach's correction for particles. The inverse of
 
 with √(p_s² + p_em²) for p_s, so that both other techniques are in it.
 
+At a delta lobe, F_k is its value, p_k and p̃_k are probabilities, and étendue puts (η_k^+/η_k^-)² in place of the
+cosines. What a delta light sends through such a lobe first of all has w_L = 1: nothing else finds it (`alone`).
+
 One connection of each subpath is kept, with a probability proportional to what it brings, and stands for all (weighted
 reservoir sampling; in expectation nothing changes). So a subpath costs one record, however long. Detached throughout.
 """
@@ -29,10 +32,11 @@ from ..core.sensor_frame import View, look_at
 from ..core.surface_code import surface_code
 from ..core.varying import varying
 from .bounce import PathLimits, PathState, bounce
+from .delta_step import delta_step
 from .light_source import LightStart
 from .light_technique import SHORTEST, LightTechnique, average, cosine_ratio, focuses
 from .rays import interaction
-from .scattering import mixture_pdf
+from .scattering import Mixture, Scattering, delta_probability, mixture_pdf
 from .sensor_connection import on_film, seen_by_sensor
 
 #: Share of what is black in the probability of being kept, where the derivative of what is black is wanted.
@@ -47,23 +51,24 @@ class LightVertex:
     shape: mi.UInt32  # its `surface_code`
     prim_index: mi.UInt32
     prim_uv: mi.Point2f
+    delta: mi.Bool  # left by a delta lobe, away from the light
 
 
 class LightVertices:
     """Memory for the vertices of `lanes` light subpaths, vertex-major. A plain class: never loop state."""
 
-    BYTES = 4 * 7  # of one vertex
+    BYTES = 4 * 7 + 1  # of one vertex
 
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
-        self.data = LightVertex(
-            dr.empty(mi.Point3f, size), dr.empty(mi.UInt32, size), dr.empty(mi.UInt32, size), dr.empty(mi.Point2f, size)
-        )
+        types = (mi.Point3f, mi.UInt32, mi.UInt32, mi.Point2f, mi.Bool)
+        self.data = LightVertex(*(dr.empty(kind, size) for kind in types))
 
-    def write(self, k: mi.UInt32, si: mi.SurfaceInteraction3f, pi, active: mi.Bool) -> None:
-        vertex = LightVertex(si.p, surface_code(pi), mi.UInt32(pi.prim_index), mi.Point2f(pi.prim_uv))
+    def write(self, k: mi.UInt32, si: mi.SurfaceInteraction3f, pi, delta: mi.Bool, active: mi.Bool) -> None:
+        uv = mi.Point2f(pi.prim_uv)
+        vertex = LightVertex(si.p, surface_code(pi), mi.UInt32(pi.prim_index), uv, mi.Bool(delta))
         dr.scatter(self.data, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
 
     def read(self, k: mi.UInt32, lane: mi.UInt32, active: mi.Bool) -> LightVertex:
@@ -77,6 +82,7 @@ class LightPath:
     value: mi.Spectrum  # to be splatted, over the number of subpaths; 0: none
     scale: mi.Float  # the same without L_e and the F_k
     count: mi.UInt32  # its surface vertices, 0: none
+    alone: mi.Bool  # of a class that no camera path finds
     p: mi.Point2f  # film position [px]
     film: mi.Point2f  # the same in [0, 1]² of the crop window
     aperture: mi.Point2f
@@ -87,7 +93,7 @@ class LightPath:
     def none() -> LightPath:
         zero = mi.Float(0)
         point = mi.Point2f(0)
-        return LightPath(mi.Spectrum(0), zero, mi.UInt32(0), point, point, mi.Point2f(0.5), zero, zero)
+        return LightPath(mi.Spectrum(0), zero, mi.UInt32(0), mi.Bool(False), point, point, mi.Point2f(0.5), zero, zero)
 
     def offered(self, other: LightPath, u: mi.Float) -> LightPath:
         """This or `other`, which has an `own` only."""
@@ -110,12 +116,13 @@ class _Carried:
     scale: mi.Float  # the same without L_e and the F_k
     U: mi.Float  # see the module
     likely: mi.Float  # as β, with the densities p_k for F_k: not 0 where the path is black
+    alone: mi.Bool  # see `LightPath`
 
     @staticmethod
     def of(value: mi.Spectrum, E: mi.Float) -> _Carried:
         inverse = dr.select(E > 0, dr.rcp(E), 0)
         β = value * inverse
-        return _Carried(β, inverse, mi.Float(inverse), average(β))
+        return _Carried(β, inverse, mi.Float(inverse), average(β), mi.Bool(False))
 
 
 @dataclass
@@ -127,12 +134,20 @@ class _Turn:
     step: mi.Float  # c^-/c^+
 
     @staticmethod
-    def towards(wo: mi.Vector3f, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, share: float, active) -> _Turn:
-        """`wo`: local. `share`: of uniform directions, of the camera's paths."""
+    def towards(wo: mi.Vector3f, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, mixture: Mixture, active) -> _Turn:
+        """`wo`: local. `mixture`: of the camera's paths."""
         turned = mi.SurfaceInteraction3f(si)
         turned.wi = mi.Vector3f(wo)
         F, p = bsdf.eval_pdf(mi.BSDFContext(), turned, si.wi, active)
-        return _Turn(F, mixture_pdf(turned, bsdf, si.wi, p, share), cosine_ratio(si, wo))
+        return _Turn(F, mixture_pdf(turned, bsdf, si.wi, p, mixture), cosine_ratio(si, wo))
+
+    @staticmethod
+    def by_delta(wo: mi.Vector3f, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, mixture: Mixture, active) -> _Turn:
+        """The same at a delta lobe: its value, its probability, and what étendue makes of the step."""
+        turned = mi.SurfaceInteraction3f(si)
+        turned.wi = mi.Vector3f(wo)
+        lobe = delta_step(mi.BSDFContext(), turned, bsdf, si.to_world(si.wi), active)
+        return _Turn(lobe.value, delta_probability(bsdf, lobe.probability, mixture), dr.square(lobe.η))
 
 
 def _first_segment(
@@ -163,8 +178,9 @@ def _connected(
     aperture = u if technique.frame.kind == "thinlens" else mi.Point2f(0.5)
     view = look_at(technique.frame, si.p, aperture)
     bsdf = si.bsdf()
-    seen = active & on_film(technique.frame, view) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    turn = _Turn.towards(si.to_local(-view.ω), si, bsdf, limits.uniform_share, seen)
+    margin = dr.select(carried.alone, technique.margin, 0)
+    seen = active & on_film(technique.frame, view, margin) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    turn = _Turn.towards(si.to_local(-view.ω), si, bsdf, limits.mixture, seen)
     end = turn.step / view.J_px
     U = carried.U * turn.p * end / technique.ratio
     w = mi.Float(1) if technique.exclusive else dr.rcp(1 + dr.square(U))
@@ -174,7 +190,7 @@ def _connected(
         own += BLACK_SHARE * carried.likely * turn.p * end * w
     own = dr.select(seen & dr.isfinite(own), own, 0)
     zero = mi.Float(0)
-    return LightPath(value, carried.scale * end * w, s, view.p, view.film, aperture, zero, own), view
+    return LightPath(value, carried.scale * end * w, s, carried.alone, view.p, view.film, aperture, zero, own), view
 
 
 @dr.syntax
@@ -191,7 +207,7 @@ def trace_light(
     `limits`: of the camera's paths, with their `light`.
     """
     technique = limits.light
-    own = replace(limits, uniform_share=0.0, light=None)
+    own = replace(limits, uniform_share=0.0, critical=technique.critical, light=None)
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     ray = mi.Ray3f(start.ray)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=True)
@@ -203,8 +219,6 @@ def trace_light(
         si = interaction(pi, ray, limits)
         bsdf = si.bsdf()
         first = path.k == 0
-        if vertices is not None:
-            vertices.write(path.k, si, pi, active)
         s = path.k + 1
         ends = active & (s >= SHORTEST)
         found, view = _connected(technique, sampler.next_2d(), si, s, carried, limits, ends)
@@ -212,10 +226,13 @@ def trace_light(
         kept = kept.offered(found, sampler.next_1d())
 
         onward = bounce(si, bsdf, sampler, path, own, ctx, active & (~first | focuses(bsdf)))
-        alive = onward.alive & ~onward.scattering.delta & (s < technique.longest)
-        turn = _Turn.towards(onward.scattering.wo, si, bsdf, limits.uniform_share, alive)
+        delta = onward.scattering.delta
+        if vertices is not None:
+            vertices.write(path.k, si, pi, delta, active)
+        alive = onward.alive & (s < technique.longest)
+        turn = _turn(technique, onward.scattering, si, bsdf, limits, alive)
         step = turn.step / onward.scattering.pdf
-        p = dr.select(first, _root(start, turn.p, pdf_em), turn.p)
+        p = dr.select(first, _root(start, turn.p, dr.select(delta, 0, pdf_em)), turn.p)
         carried = dr.select(
             alive,
             _Carried(
@@ -223,6 +240,7 @@ def trace_light(
                 carried.scale * step / onward.survival,
                 carried.U * p * step,
                 carried.likely * turn.p * step / onward.survival,
+                carried.alone | (first & start.delta & delta),
             ),
             carried,
         )
@@ -232,6 +250,14 @@ def trace_light(
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= pi.is_valid()
     return kept.standing_for_all()
+
+
+def _turn(technique: LightTechnique, s: Scattering, si, bsdf: mi.BSDFPtr, limits: PathLimits, active) -> _Turn:
+    """The vertex `si`, left by `s`, as read from the sensor."""
+    smooth = _Turn.towards(s.wo, si, bsdf, limits.mixture, active & ~s.delta)
+    if not technique.delta_lobes:
+        return smooth
+    return dr.select(s.delta, _Turn.by_delta(s.wo, si, bsdf, limits.mixture, active & s.delta), smooth)
 
 
 def _root(start: LightStart, p: mi.Float, pdf_em: mi.Float) -> mi.Float:

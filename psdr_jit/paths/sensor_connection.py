@@ -8,10 +8,11 @@ from ..core.sensor_frame import SensorFrame, View
 from .rays import SHADOW_EPSILON, skip_emitters
 
 
-def on_film(frame: SensorFrame, view: View) -> mi.Bool:
-    """Does the view land where there are camera samples, between the clipping planes?"""
+def on_film(frame: SensorFrame, view: View, margin: mi.Float | float = 0.0) -> mi.Bool:
+    """Does the view land where there are camera samples, or at most `margin` [px] off, between the clipping planes?"""
     lower, upper = frame.window
-    inside = (view.p.x >= lower[0]) & (view.p.x < upper[0]) & (view.p.y >= lower[1]) & (view.p.y < upper[1])
+    x, y = view.p.x, view.p.y
+    inside = (x >= lower[0] - margin) & (x < upper[0] + margin) & (y >= lower[1] - margin) & (y < upper[1] + margin)
     return view.valid & inside
 
 

@@ -84,7 +84,7 @@ class Scatter:
         """
         s = self.onward.scattering
         active = self.onward.alive & ~s.delta
-        pdf = reverse_pdf(mi.BSDFContext(), self.si, self.bsdf, s.wo, self.limits.uniform_share, active)
+        pdf = reverse_pdf(mi.BSDFContext(), self.si, self.bsdf, s.wo, self.limits.mixture, active)
         return dr.select(active, pdf, 0)
 
 

@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
+from ..core.film import filter_reach
 from ..core.film_samples import FilmDensity
 from ..core.line_guide import LineGuide, LineTally
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
+from ..core.varying import varying
 from ..options import Options
+from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.light_technique import LightTechnique
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
@@ -29,6 +32,10 @@ TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
 
 #: Of one render call: light subpaths, in a tuple once they have been asked for.
 LIGHT: Slot[tuple[LightTechnique | None] | None] = Slot(lambda: None)
+
+
+#: Of one render call: rough glass whose index is differentiated, in a tuple once it has been looked for.
+CRITICAL: Slot[tuple[CriticalAngle | None] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -96,9 +103,21 @@ class Job:
             self.shared[LIGHT] = (self._light_technique(),)
         return self.shared[LIGHT][0]
 
+    @property
+    def critical(self) -> CriticalAngle | None:
+        """Rough glass whose index of refraction is differentiated, read once per render call."""
+        if not any(name.endswith(".eta") for shape in self.facts.shapes for name in shape.material):
+            return None
+        if self.shared[CRITICAL] is None:
+            self.shared[CRITICAL] = (critical_angle(self.scene),)
+        return self.shared[CRITICAL][0]
+
     def _light_technique(self) -> LightTechnique | None:
         plan = self.plan
-        return light_technique(self.scene, self.facts, self.frame, self.options, plan.light, plan.prunes)
+        technique = light_technique(self.scene, self.facts, self.frame, self.options, plan.light, plan.prunes)
+        if technique is None or not technique.delta_lobes:
+            return technique
+        return replace(technique, margin=varying(mi.Float, filter_reach(self.film)))
 
     @property
     def limits(self) -> PathLimits:

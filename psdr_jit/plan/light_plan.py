@@ -1,7 +1,8 @@
 """Do light subpaths run, and why: where small lights shine on surfaces that may focus them, and nowhere else.
 
-What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that scatter
-near the mirrored or bent direction (`paths.light_technique.focuses`), and a scene without any is left to camera paths.
+What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that
+scatter in or near the mirrored or bent direction (`paths.light_technique.focuses`); a scene without any is left to
+camera paths.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..options import Options
 from ..paths.light_source import light_sources
-from ..paths.light_technique import SHORTEST, LightTechnique
+from ..paths.light_technique import FOCUSING, SHORTEST, LightTechnique
 from ..scene.facts import SceneFacts, ShapeFacts
 
 #: Lights that are traced. Where the others are, camera paths find them alone.
@@ -72,15 +73,15 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     ]
 
 
-def rough_shapes(facts: SceneFacts) -> list[int]:
-    """Numbers of the shapes in the scene that scatter light near one direction, and not diffusely as well."""
-    glossy, diffuse = int(mi.BSDFFlags.Glossy), int(mi.BSDFFlags.Diffuse)
-    return [s.index for s in facts.shapes if s.index >= 0 and s.bsdf_flags & glossy and not s.bsdf_flags & diffuse]
+def narrow_shapes(facts: SceneFacts) -> list[int]:
+    """Numbers of the shapes in the scene that scatter light in or near one direction, and not diffusely as well."""
+    narrow, diffuse = sum(int(getattr(mi.BSDFFlags, lobe)) for lobe in FOCUSING), int(mi.BSDFFlags.Diffuse)
+    return [s.index for s in facts.shapes if s.index >= 0 and s.bsdf_flags & narrow and not s.bsdf_flags & diffuse]
 
 
 def focusing_shapes(scene: mi.Scene, facts: SceneFacts) -> list[int]:
     """Those of them that may gather light on others, and that one can aim at."""
-    sizes = {k: scene.shapes()[k].bbox().extents() for k in rough_shapes(facts)}
+    sizes = {k: scene.shapes()[k].bbox().extents() for k in narrow_shapes(facts)}
     return [k for k, size in sizes.items() if math.hypot(*size) < SPANS * facts.extent]
 
 
@@ -93,14 +94,14 @@ def plan_light(
     """
     if options.light_paths == "off":
         return None
-    _warn_about_unseen_light(facts, memory)
     if dr.flag(dr.JitFlag.FreezingScope):
         return LightPlan(False, "where lights and surfaces are cannot be read while a function is being frozen")
     targets = focusing_shapes(scene, facts)
+    _warn_about_unseen_light(facts, targets, memory)
     for obstacle, reason in (
-        (not rough_shapes(facts), "no surface is rough glass or a rough mirror, nothing is focused"),
+        (not narrow_shapes(facts), "no surface is glass or a mirror, nothing is focused"),
         (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)}"),
-        (not targets, "rough glass and rough mirrors span the scene, there is nothing to aim at"),
+        (not targets, "glass and mirrors span the scene, there is nothing to aim at"),
         (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
         (facts.sensor.plugin not in KINDS.values(), f"nothing is connected to a '{facts.sensor.plugin}' sensor"),
     ):
@@ -129,6 +130,7 @@ def light_technique(
         ratio=varying(mi.Float, float(plan.subpaths(frame, 1))),
         longest=min(options.depth_limit - 1, LONGEST),
         exclusive=options.light_paths == "only",
+        delta_lobes=facts.has_delta_lobes,
     )
 
 
@@ -142,15 +144,23 @@ def _only_lights_change(facts: SceneFacts) -> bool:
     )
 
 
-def _warn_about_unseen_light(facts: SceneFacts, memory: Memory | None) -> None:
+def _warn_about_unseen_light(facts: SceneFacts, targets: list[int], memory: Memory | None) -> None:
     """A point's light by way of a mirror or smooth glass: from the camera's side nothing finds it."""
-    points = [f"'{e.name}' ({e.plugin})" for e in facts.emitters if e.delta]
-    mirrors = [f"'{s.name}'" for s in facts.shapes if any("Null" not in lobe for lobe in s.delta_lobes)]
-    if points and mirrors:
-        warn_once(
-            f"light of {', '.join(points)} that {', '.join(mirrors[:3])} mirrors or bends onto other surfaces is not "
-            "in the image, as in Mitsuba's path: light subpaths do not pass mirrors and smooth glass; make them a "
-            "little rough, or the light an area light",
-            UnsupportedWarning,
-            memory,
-        )
+    mirrors = [s for s in facts.shapes if any("Null" not in lobe for lobe in s.delta_lobes)]
+    points = [e for e in facts.emitters if e.delta]
+    if not (points and mirrors):
+        return
+    far = [e for e in points if e.plugin not in TRACED]
+    large = [s for s in mirrors if s.index not in targets]
+    shown = f"light of {_listed(far or points)} that {_listed(large or mirrors)} mirrors or bends onto other surfaces"
+    if far or large:
+        why = f"light subpaths start from {', '.join(TRACED)} lights and are aimed at bodies smaller than the scene"
+        message = f"{shown} is not in the image, as in Mitsuba's path: {why}; make the light an area light"
+    else:
+        message = f"{shown} is in the image, but not what mirrors and smooth glass show of it, as in Mitsuba's path"
+    warn_once(message, UnsupportedWarning, memory)
+
+
+def _listed(things: list) -> str:
+    """Lights or shapes by their names, three at most."""
+    return ", ".join(f"'{t.name}' ({t.plugin})" for t in things[:3]) + (" and others" if len(things) > 3 else "")

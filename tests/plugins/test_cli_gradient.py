@@ -167,7 +167,8 @@ def test_scene_options_reach_the_integrator():
     assert spec == {"type": "psdr_path", "max_depth": 3, "rr_depth": 77, "hide_emitters": False}
     assert integrator_specs.integrator_spec(scene, max_depth=5)["max_depth"] == 5
     assert integrator_specs.path_options(integrator_specs.build(spec))["rr_depth"] == 77
-    assert integrator_specs.path_options(integrator_specs.reference({**spec, "max_depth": -1}))["max_depth"] == -1
+    reference = integrator_specs.reference({**spec, "max_depth": -1}, scene)
+    assert integrator_specs.path_options(reference)["max_depth"] == -1
     own = scene_io.integrator_properties(CBOX, max_depth=3)
     assert own == {"type": "path", "max_depth": 3, "rr_depth": 5}
 

@@ -14,7 +14,7 @@ from psdr_jit.paths.bounce import PathLimits
 from psdr_jit.paths.dry_walk import count_vertices, touches
 from psdr_jit.paths.rays import first_hit, interaction
 from psdr_jit.paths.recording import PathRecords
-from psdr_jit.paths.scattering import mixture_pdf, reverse_pdf
+from psdr_jit.paths.scattering import PLAIN, Mixture, mixture_pdf, reverse_pdf
 from psdr_jit.paths.sink import NoSink
 from psdr_jit.paths.walk import walk
 
@@ -84,9 +84,9 @@ def test_densities_both_ways(variant, name, share):
     back.wi = mi.Vector3f(s.wo)
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
     alone = bsdf.pdf(ctx, back, si.wi, smooth)
-    expected = dr.select(smooth, mixture_pdf(back, bsdf, si.wi, alone, share), 0)
+    expected = dr.select(smooth, mixture_pdf(back, bsdf, si.wi, alone, Mixture(share)), 0)
     assert np.allclose(np.array(reverse), np.array(expected), rtol=1e-6)
-    forth = mixture_pdf(si, bsdf, s.wo, bsdf.pdf(mi.BSDFContext(), si, s.wo, smooth), share)
+    forth = mixture_pdf(si, bsdf, s.wo, bsdf.pdf(mi.BSDFContext(), si, s.wo, smooth), Mixture(share))
     chosen = np.array(smooth)
     assert np.allclose(np.array(s.pdf)[chosen], np.array(forth)[chosen], rtol=1e-4)
     if share == 0:
@@ -103,7 +103,7 @@ def test_the_reverse_of_a_diffuse_surface(variant):
     si.t = mi.Float(1, 1)
     bsdf = mi.load_dict({"type": "diffuse"})  # the pointer does not keep it
     wo = dr.normalize(mi.Vector3f(0.3, 0, 0.2))
-    pdf = reverse_pdf(mi.BSDFContext(), si, mi.BSDFPtr(bsdf), wo, 0.0, mi.Bool(True))
+    pdf = reverse_pdf(mi.BSDFContext(), si, mi.BSDFPtr(bsdf), wo, PLAIN, mi.Bool(True))
     assert np.allclose(np.array(pdf), np.array(si.wi.z) / np.pi, rtol=1e-5)
 
 

@@ -30,15 +30,15 @@ def interaction(below: bool) -> mi.SurfaceInteraction3f:
 @pytest.mark.parametrize("below", [False, True])
 @pytest.mark.parametrize("name", BSDFS)
 def test_mixture(variant, name, below):
-    from psdr_jit.paths.scattering import UNIFORM_SHARE, mixture_pdf, sample_scattering
+    from psdr_jit.paths.scattering import PLAIN, UNIFORM_SHARE, Mixture, mixture_pdf, sample_scattering
 
     bsdf = mi.load_dict(BSDFS[name])
     si, ctx = interaction(below), mi.BSDFContext()
     rng = np.random.default_rng(0)
     u_lobe, u = mi.Float(rng.random(COUNT)), mi.Point2f(rng.random(COUNT), rng.random(COUNT))
     pointer = mi.BSDFPtr(bsdf)
-    s = sample_scattering(ctx, si, pointer, u_lobe, u, UNIFORM_SHARE, False, mi.Bool(True))
-    plain = sample_scattering(ctx, si, pointer, u_lobe, u, 0.0, False, mi.Bool(True))
+    s = sample_scattering(ctx, si, pointer, u_lobe, u, Mixture(UNIFORM_SHARE), False, mi.Bool(True))
+    plain = sample_scattering(ctx, si, pointer, u_lobe, u, PLAIN, False, mi.Bool(True))
 
     # both estimate the albedo
     estimate, expected = (np.array(x.weight.x, dtype=float) * np.ones(COUNT) for x in (s, plain))
@@ -47,21 +47,21 @@ def test_mixture(variant, name, below):
 
     smooth = ~np.array(s.delta) & (np.array(s.pdf) > 0)
     f, pdf = bsdf.eval_pdf(ctx, si, s.wo)
-    mixed = np.array(mixture_pdf(si, pointer, s.wo, pdf, UNIFORM_SHARE)) * np.ones(COUNT)
+    mixed = np.array(mixture_pdf(si, pointer, s.wo, pdf, Mixture(UNIFORM_SHARE))) * np.ones(COUNT)
     assert np.allclose(mixed[smooth], np.array(s.pdf)[smooth], rtol=1e-4)
     assert np.allclose((np.array(f.x) * np.ones(COUNT))[smooth] / mixed[smooth], estimate[smooth], rtol=1e-3, atol=1e-6)
     # the density integrates to one over the directions that it can give
     if "mirror" not in name and "plastic" not in name and estimate.any():
         sphere = mi.warp.square_to_uniform_sphere(u)
         _, pdf = bsdf.eval_pdf(ctx, si, sphere)
-        mass = np.array(mixture_pdf(si, pointer, sphere, pdf, UNIFORM_SHARE)) * 4 * np.pi
+        mass = np.array(mixture_pdf(si, pointer, sphere, pdf, Mixture(UNIFORM_SHARE))) * 4 * np.pi
         assert abs(mass.mean() - 1) < 6 * mass.std() / np.sqrt(COUNT) + 0.03  # microfacet sampling loses a little
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
 def test_refused_directions_do_not_go_on(variant, share):
     """From inside at 45 degrees a rough dielectric refuses a part of what it samples: f / pdf is not its weight."""
-    from psdr_jit.paths.scattering import sample_scattering
+    from psdr_jit.paths.scattering import Mixture, sample_scattering
 
     bsdf = mi.load_dict({"type": "roughdielectric", "alpha": 0.3})
     si, ctx = interaction(below=True), mi.BSDFContext()
@@ -71,7 +71,7 @@ def test_refused_directions_do_not_go_on(variant, share):
     pointer = mi.BSDFPtr(bsdf)
     _, weight = bsdf.sample(ctx, si, u_lobe, u)
     expected = np.array(weight.x, dtype=float)
-    s = sample_scattering(ctx, si, pointer, u_lobe, u, share, True, mi.Bool(True))
+    s = sample_scattering(ctx, si, pointer, u_lobe, u, Mixture(share), True, mi.Bool(True))
     f = np.array(bsdf.eval(ctx, si, s.wo).x, dtype=float)
     pdf = np.array(s.pdf)
     ratio = np.divide(f, pdf, out=np.zeros(COUNT), where=pdf > 0)  # what a path that goes on makes of it
@@ -109,7 +109,7 @@ def test_frames_of_triangles_in_one_plane_agree(variant):
 @pytest.mark.parametrize("grazing", [False, True])
 def test_two_delta_lobes_share_even_choices(variant, kind, grazing):
     """Each is chosen as often as is said; both are worth what they are; in total reflection there is one."""
-    from psdr_jit.paths.scattering import UNIFORM_SHARE, sample_scattering
+    from psdr_jit.paths.scattering import UNIFORM_SHARE, Mixture, sample_scattering
 
     si, ctx = interaction(below=grazing), mi.BSDFContext()
     if grazing:  # from inside, beyond the critical angle of glass
@@ -118,7 +118,7 @@ def test_two_delta_lobes_share_even_choices(variant, kind, grazing):
     u_lobe, u = mi.Float(rng.random(COUNT)), mi.Point2f(rng.random(COUNT), rng.random(COUNT))
     bsdf = mi.load_dict({"type": kind})
     pointer = mi.BSDFPtr(bsdf)
-    s = sample_scattering(ctx, si, pointer, u_lobe, u, UNIFORM_SHARE, False, mi.Bool(True))
+    s = sample_scattering(ctx, si, pointer, u_lobe, u, Mixture(UNIFORM_SHARE), False, mi.Bool(True))
     same_side = np.array(s.wo.z * si.wi.z) > 0
     pdf, weight = np.array(s.pdf), np.array(s.weight)[0]
     assert np.array(s.delta).all()
