@@ -1,16 +1,12 @@
-"""What the subcommands share: argument types, progress on the terminal, Mitsuba's own chatter."""
+"""What the subcommands share: argument types, the scene, the integrator."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from psdr_jit.errors import OptionError
-
-PATIENCE = 2.0  # seconds before a progress bar appears
 
 
 def vector(text: str) -> tuple[float, float, float]:
@@ -57,36 +53,6 @@ def definitions(args: argparse.Namespace) -> dict[str, str]:
         if "=" not in item:
             raise OptionError(f"-D {item}: expected NAME=VALUE")
     return dict(item.split("=", 1) for item in args.define)
-
-
-@contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, str], None]]:
-    """Yields `report(done, total, note)`. The bar goes to stderr, and only if the work takes a while."""
-    import time
-
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    start = time.perf_counter()
-    console = Console(file=sys.stderr)
-    columns = (TextColumn(label), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
-               TextColumn("{task.fields[note]}"))
-    bar = Progress(*columns, console=console, transient=not console.is_terminal)
-    task = bar.add_task(label, total=1.0, note="")
-    started = False
-
-    def report(done: float, total: float, note: str = "") -> None:
-        nonlocal started
-        if not quiet and not started and time.perf_counter() - start > PATIENCE:
-            bar.start()
-            started = True
-        bar.update(task, completed=min(1.0, done / total), note=note)
-
-    try:
-        yield report
-    finally:
-        if started:
-            bar.stop()
 
 
 def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:

@@ -59,9 +59,8 @@ def run(args: argparse.Namespace) -> int:
     scene_io.check_sensor(scene, args.sensor)
     spec = common.integrator_of(args, scene)
     parameter = perturb(scene, args.wrt, args.direction, rotate=args.rotate, index=args.index)
-    with common.progress_bar("gradient", args.quiet) as report:
-        result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds,
-                          sensor=args.sensor, progress=report)
+    result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds, sensor=args.sensor,
+                      progress=not args.quiet)
     images.write_exr(exr, result.layers(), result.metadata())
     title = f"d image / d {result.param}\n{result.direction}"
     images.write_derivative_png(png, result.total, title)
@@ -90,10 +89,7 @@ def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, 
     """Run the check and print its verdict."""
     from psdr_jit.derivative.check import check_gradient
 
-    limit = args.check_seconds
-    with common.progress_bar("check", args.quiet) as report:
-        result = check_gradient(
-            scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor, max_seconds=limit,
-            progress=lambda t, v: report(t, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}"))
+    result = check_gradient(scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor,
+                            max_seconds=args.check_seconds, progress=not args.quiet)
     print(result)
     return OK if result.passed else CHECK_FAILED

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import common
+from psdr_jit.core import progress
 from psdr_jit.errors import OptionError, StorageError
 
 NAME = "optimize"
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     loop.require_folder(out, args.resume)  # before targets are rendered
     problem = configs.problem_of(config)
     start = time.perf_counter()
-    with common.progress_bar("optimize", args.quiet) as report:
+    with progress.bar("optimize", args.quiet) as report:
         result = loop.run(problem, out, args.resume, report)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))

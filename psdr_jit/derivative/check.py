@@ -8,16 +8,19 @@ root mean square z-score of pixel blocks, and the largest |z|. A gradient of 0, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Real
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.progress import Report, reporting
 from psdr_jit.core.threads import one_at_a_time
-from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative import integrator_specs, show
 from psdr_jit.derivative.finite_differences import CentralDifference, default_block
 from psdr_jit.derivative.gradient import DerivativeSampler, differentiable
 from psdr_jit.derivative.perturbation import Perturbation, perturb
@@ -71,6 +74,12 @@ class CheckResult:
     @property
     def passed(self) -> bool:
         return self.verdict.verdict == PASS
+
+    def _repr_png_(self) -> bytes:
+        return show.check_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.check_html(self)
 
     def __str__(self) -> str:
         v = self.verdict
@@ -171,14 +180,14 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
                    eps: float | None = None, reference_spp: int | None = None, block: int | None = None,
                    tolerance: float = 0.02, max_stderr: float = 0.007, max_seconds: float = 120.0,
                    zero_bound: float | None = None,
-                   progress: Callable[[float, Verdict], None] | None = None) -> CheckResult:
+                   progress: Callable[[float, Verdict], None] | bool | None = None) -> CheckResult:
     """Compare forward-mode derivatives with central differences until the verdict is certain or time is up.
 
     The reference is Mitsuba's `path` with the max_depth, rr_depth and hide_emitters of `integrator`. Seeds go
     to whichever of the two lowers the error of the gain more per second. Only terms of the estimate that are
     implemented are in it: where others matter, the check fails, and should.
 
-    `progress(seconds, verdict)` is called after every batch of seeds.
+    `progress(seconds, verdict)` is called after every batch of seeds; True shows a bar, None does so in notebooks.
     """
     _require_sane(sensor, counts=dict(spp=spp, reference_spp=reference_spp, block=block),
                   reals=dict(eps=eps, max_seconds=max_seconds, tolerance=tolerance, max_stderr=max_stderr,
@@ -195,23 +204,35 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
     estimate = DerivativeSampler(param, tested, sensor, spp)
     reference = CentralDifference(param, spec, sensor, reference_spp, eps)
     rule = dict(tolerance=tolerance, max_stderr=max_stderr, zero_bound=zero_bound)
-    try:
-        verdict, block = _collect(estimate, reference, block, start, start + max_seconds, progress, rule)
+    with reporting("check", progress, partial(_noted, max_seconds)) as report, _restored(param):
+        verdict, block = _collect(estimate, reference, block, start, start + max_seconds, report, rule)
         # Differences across a kink (an edge that meets the corner of a pixel block) are biased by O(eps), not
         # O(eps^2): a failure is believed only if it is gross, or if a smaller step does not cure it.
         for _ in range(REFINEMENTS if eps is None else 0):
             if verdict.verdict != FAIL or not abs(verdict.gain - 1) < GROSS:
                 break
             finer = CentralDifference(param, spec, sensor, reference_spp, reference.eps / 4)
-            retry, block = _collect(estimate, finer, block, start, start + max_seconds, progress, rule)
+            retry, block = _collect(estimate, finer, block, start, start + max_seconds, report, rule)
             if retry.verdict == INCONCLUSIVE:
                 break
             verdict, reference = retry, finer
-    finally:
-        param.restore()
     return CheckResult(verdict, estimate.seeds, 2 * reference.seeds, spp, reference.spp, reference.eps, block,
                        time.perf_counter() - start, tuple(terms) or ("all of the given integrator",),
                        param.name, param.label, estimate.images.mean(), reference.result(block).mean)
+
+
+def _noted(limit: float, report: Report) -> Callable[[float, Verdict], None]:
+    """What `_collect` calls, for a bar."""
+    return lambda seconds, v: report(seconds, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}")
+
+
+@contextmanager
+def _restored(param: Perturbation) -> Iterator[None]:
+    """Leaves the scene as it was found."""
+    try:
+        yield
+    finally:
+        param.restore()
 
 
 def _require_sane(sensor: Any, counts: dict[str, Any], reals: dict[str, Any]) -> None:

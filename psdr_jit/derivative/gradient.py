@@ -13,8 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from psdr_jit.core.film import require_samples
+from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
-from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative import integrator_specs, show
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages
 from psdr_jit.errors import OptionError
@@ -61,6 +62,12 @@ class GradientResult:
         if self.rejected:
             lines.append(f"  {self.rejected} samples were not finite and were dropped")
         return "\n".join(lines)
+
+    def _repr_png_(self) -> bytes:
+        return show.gradient_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.gradient_html(self)
 
     def metadata(self) -> dict[str, str]:
         """What was computed, as strings for an image header."""
@@ -118,7 +125,7 @@ class DerivativeSampler:
 @one_at_a_time
 def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
              index: int | None = None, integrator: Any = None, spp: int = 64, seeds: int = 8, sensor: int = 0,
-             progress: Callable[[int, int], None] | None = None) -> GradientResult:
+             progress: Callable[[int, int], None] | bool | None = None) -> GradientResult:
     """d(image)/d(theta) for `param` moved along a direction, in forward mode.
 
     `param`, `direction`, `rotate`, `index` as in `perturb`. `integrator`: an instantiated integrator (total
@@ -127,6 +134,7 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
 
     Every one of the `seeds` is an independent image with `spp` samples per pixel and term; the standard
     errors come from their scatter. The scene is left as it was found.
+    `progress(done, total)` is called after every seed; True shows a bar, None does so in notebooks.
     """
     require_count("spp", spp)
     require_count("seeds", seeds)
@@ -140,16 +148,17 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
                                                  min(seeds, MAX_GROUPS))
     total, primal = GroupedImages(min(seeds, MAX_GROUPS)), GroupedImages(1)
     try:
-        for seed in range(seeds):
-            with dr.suspend_grad():
-                image = primal_integrator.render(scene, view, seed=seed, spp=spp)
-            primal.add(integrator_specs.to_image(image))
-            images = [s.render(seed) for s in samplers.values()]
-            for s, image in zip(samplers.values(), images, strict=True):
-                s.images.add(image)
-            total.add(sum(images))
-            if progress is not None:
-                progress(seed + 1, seeds)
+        with reporting("gradient", progress) as report:
+            for seed in range(seeds):
+                with dr.suspend_grad():
+                    image = primal_integrator.render(scene, view, seed=seed, spp=spp)
+                primal.add(integrator_specs.to_image(image))
+                images = [s.render(seed) for s in samplers.values()]
+                for s, image in zip(samplers.values(), images, strict=True):
+                    s.images.add(image)
+                total.add(sum(images))
+                if report is not None:
+                    report(seed + 1, seeds)
     finally:
         param.restore()
     lost = _report_not_finite(samplers)

@@ -15,7 +15,7 @@ import numpy as np
 
 from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
-from psdr_jit.inverse import lock
+from psdr_jit.inverse import lock, show
 from psdr_jit.inverse.checkpoint import Checkpoint
 from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
@@ -44,6 +44,13 @@ class Result:
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
     not_written: list[str] = field(default_factory=list)  # what the disk did not take ...
     lost: dict[str, str] = field(default_factory=dict)  # ... and of that the final values, with the reason
+    folder: Path | None = None  # with log, pictures and values
+
+    def _repr_png_(self) -> bytes:
+        return show.result_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.result_html(self)
 
 
 @dataclass
@@ -103,7 +110,7 @@ def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> 
             journal.finish(problem, result)
     finally:
         journal.close()
-    result.not_written, result.lost = journal.not_written, journal.lost
+    result.not_written, result.lost, result.folder = journal.not_written, journal.lost, folder
     return result
 
 
