@@ -13,7 +13,7 @@ Symbols of the papers, and what they are called in the code (`_d`: attached to t
 Data flows one way, through the rooms (folders) in this order; each imports from those before it only:
 
     setup → core → scene → paths → plan → edges → sampling → interior, boundary → driver → plugins
-    → derivative → inverse → cli
+    → derivative → inverse → report → cli
 """
 
 from __future__ import annotations

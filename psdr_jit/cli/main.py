@@ -41,6 +41,7 @@ COMMANDS = {
     ),
     "optimize": Command("psdr_jit.cli.optimize", "recover parameters of a scene from images", renders=True),
     "plan": Command("psdr_jit.cli.plan", "show what differentiating a scene would compute, and why", renders=True),
+    "report": Command("psdr_jit.cli.report", "make one HTML page of a derivative or an optimisation", renders=False),
     "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
     "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),
     "doctor": Command("psdr_jit.cli.doctor", "check Python, Mitsuba, Dr.Jit and LLVM", renders=False),

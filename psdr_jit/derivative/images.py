@@ -96,6 +96,14 @@ def read_exr(path: str | os.PathLike) -> dict[str, np.ndarray]:
         return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
 
 
+def read_metadata(path: str | os.PathLike) -> dict[str, str]:
+    """What `write_exr` was given as metadata."""
+    import OpenEXR
+
+    with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+        return {key.removeprefix("psdr_"): str(v) for key, v in file.header().items() if key.startswith("psdr_")}
+
+
 def write_derivative_png(path: str | os.PathLike, image: np.ndarray, title: str = "",
                          unit: str = "radiance per unit") -> Path:
     """Write one derivative image (H, W, C) in red (positive) and blue (negative) with a colour bar."""
