@@ -1,9 +1,10 @@
-"""What the subcommands share: argument types, the scene, the integrator."""
+"""What the subcommands share: argument types, the scene, the integrator, the workers."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from psdr_jit.errors import OptionError
@@ -45,6 +46,36 @@ def add_integrator_argument(parser: argparse.ArgumentParser) -> None:
     """Which of our integrators: for the commands that differentiate."""
     parser.add_argument("--integrator", metavar="NAME",
                         help="psdr_path or psdr_bdpt (default: the scene's own, or psdr_path)")
+
+
+def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """Who renders: for commands whose work can be handed out."""
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--workers", type=int, metavar="N", help="render in N processes of this machine, by Dask")
+    who.add_argument("--scheduler", metavar="ADDRESS",
+                     help="render with the workers of a Dask scheduler, such as tcp://10.0.0.1:8786")
+    parser.add_argument("--send", action="store_true",
+                        help="let scene, meshes and textures travel to workers that do not share the folder")
+
+
+@contextmanager
+def cluster(args: argparse.Namespace) -> Iterator[Any]:
+    """A Dask client as asked for, or None: this process renders."""
+    if args.workers is None and args.scheduler is None:
+        yield None
+        return
+    from psdr_jit.cluster import engine
+
+    require_positive(workers=args.workers)
+    with engine.local(args.workers) if args.workers else engine.connected(args.scheduler) as client:
+        yield client
+
+
+def source(args: argparse.Namespace) -> Any:
+    """Where workers find the scene."""
+    from psdr_jit.cluster.source import SceneFile
+
+    return SceneFile(args.scene, definitions(args), args.send)
 
 
 def definitions(args: argparse.Namespace) -> dict[str, str]:
