@@ -10,6 +10,7 @@ import gc
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -17,7 +18,7 @@ import mitsuba as mi
 
 from psdr_jit.cluster import worker
 from psdr_jit.cluster.source import Parcel, SceneFile, parcel_of
-from psdr_jit.cluster.values import changed, digests
+from psdr_jit.cluster.values import Values, changed, digests
 from psdr_jit.cluster.worker import Place
 from psdr_jit.errors import ClusterError, OptionError, PsdrError, SetupError
 from psdr_jit.scene.names import traverse
@@ -80,11 +81,16 @@ class Engine:
             )
         self.client = client
         parcel = parcel_of(SceneFile(source) if isinstance(source, str) else source)
-        place = Place(mi.variant(), parcel, _values(scene, parcel), worker.versions())
+        self._at_first = Place(mi.variant(), parcel, _values(scene, parcel), worker.versions())
         self._said: set[str] = set()
         self._wait_for_workers()
+        self.update({})
+
+    def update(self, values: Values) -> None:
+        """Let units see these values of parameters from now on."""
+        place = replace(self._at_first, values={**self._at_first.values, **values})
         # a task, not scattered data: where the worker that has it dies, Dask makes it anew
-        self._place = client.submit(_same, place, pure=False)
+        self._place = self.client.submit(_same, place, pure=False)
 
     @property
     def workers(self) -> int:

@@ -30,7 +30,7 @@ Spec = dict[str, Any]
 def derivative_unit(held: Held, name: str, how: dict, spec: Spec, term: str, view: tuple[int, int, int]) -> tuple:
     """On a worker: `(image, values not finite, samples rejected)` of one term; `view`: sensor, spp, seed."""
     sensor, spp, seed = view
-    integrator = _integrator(held, spec, term)
+    integrator = integrator_of(held, spec, term)
     if term == PRIMAL:
         with dr.suspend_grad():
             image = integrator.render(held.scene, held.scene.sensors()[sensor], seed=seed, spp=spp)
@@ -51,7 +51,7 @@ def difference_unit(held: Held, name: str, how: dict, spec: Spec, step: tuple[in
     return image, difference.primal.mean()
 
 
-def _integrator(held: Held, spec: Spec, term: str) -> Any:
+def integrator_of(held: Held, spec: Spec, term: str) -> Any:
     """Made once per scene and kept: integrators of single terms share what they know of the scene."""
     key = json.dumps(spec, sort_keys=True)
     kept = held.kept.setdefault(key, {})

@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
+from psdr_jit.errors import CheckpointError, ClusterError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import lock, show
 from psdr_jit.inverse.checkpoint import Checkpoint
@@ -103,11 +103,13 @@ def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> 
         found = copied(state.history.best if status == DIVERGED else state.latents)
         problem.apply(found)
         start = problem.offsets(problem.start())
-        result = Result(
-            status, state.iteration, state.clock(), losses, state.history.mean, found, problem.offsets(found), start
-        )
+        result = Result(status, state.iteration, state.clock(), losses, state.history.mean, found,
+                        problem.offsets(found), start)  # fmt: skip
         if status != INTERRUPTED:
             journal.finish(problem, result)
+    except ClusterError:  # nothing has been stepped since
+        journal.keep(_checkpoint(problem, state))
+        raise
     finally:
         journal.close()
     result.not_written, result.lost, result.folder = journal.not_written, journal.lost, folder
@@ -254,10 +256,8 @@ def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
     for name, variable in problem.variables.items():
         _step(problem, state, name, variable, rate)
     problem.apply(state.latents)
-    journal.step(
-        state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
-        problem.offsets(before),
-    )  # fmt: skip
+    journal.step(state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
+                 problem.offsets(before))  # fmt: skip
     every = problem.settings.snapshot_every
     if every and state.iteration % every == 0:
         journal.snapshot(state.iteration, problem, images)
