@@ -9,7 +9,7 @@ Processes of one machine need nothing else: `psdr gradient ... --workers 2`, `ps
         psdr_jit.gradient(scene, "small-box.vertex_positions", (1, 0, 0), client=client, source=source)
 
 where `scene` was loaded from that file with these defaults; what was changed in it since is sent along. So do
-`check_gradient` and `optimize`. Any other client of Dask will do. A scheduler and its workers on several machines, and who uses them:
+`check_gradient` and `optimize`. Any other client of Dask will do. On several machines:
 
     dask scheduler --host 10.0.0.1                          # without --host it listens on every interface
     dask worker tcp://10.0.0.1:8786 --nthreads 1            # on each machine; one task at a time, on all its cores
