@@ -54,7 +54,8 @@ def of_exr(path: Path) -> Report:
 def of_run(folder: Path) -> Report:
     """Images before and after beside their targets, and curves. Raises `OptionError` if it is no folder of a run."""
     rows = rows_of(folder / "log.jsonl")
-    views = [_view_of_run(path) for path in sorted((folder / VIEWS).glob("*.exr"))]
+    views = [_compared(path.stem, _layers(path)) for path in sorted((folder / VIEWS).glob("*.exr"))]
+    views = views or _views_of_snapshots(folder / "snapshots")  # of a run that was interrupted
     if not rows and not views:
         raise OptionError(f"'{folder}' is no folder of an optimisation: there is no log.jsonl and no {VIEWS}/*.exr")
     summary = _summary(folder / "result.json")
@@ -79,13 +80,26 @@ def _curves(rows: list[dict[str, Any]]) -> list[Curve]:
     return found
 
 
-def _view_of_run(path: Path) -> View:
-    layers = _layers(path)
-    shown = [Layer(name, RADIANCE, layers[name]) for name in BEFORE_AND_AFTER if name in layers]
-    for name in ("final", "initial"):
-        if name in layers and "target" in layers:
-            shown.append(Layer(f"{name} − target", SIGNED, None, difference_of=(name, "target")))
-    return View(path.stem, shown, "radiance")
+def _views_of_snapshots(folder: Path) -> list[View]:
+    """What every view has looked like first and last, beside its target."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for path in sorted(folder.glob("*.exr")):
+        for layer, image in _layers(path).items():
+            kind, _, name = layer.partition("_")
+            if kind == "image":
+                seen = found.setdefault(name, {"initial": image})
+                seen["final"] = image
+            elif kind == "target":
+                found.setdefault(name, {})["target"] = image
+    return [_compared(name, layers) for name, layers in found.items()]
+
+
+def _compared(name: str, layers: Mapping[str, np.ndarray]) -> View:
+    shown = [Layer(kind, RADIANCE, layers[kind]) for kind in BEFORE_AND_AFTER if kind in layers]
+    for kind in ("final", "initial"):
+        if kind in layers and "target" in layers:
+            shown.append(Layer(f"{kind} − target", SIGNED, None, difference_of=(kind, "target")))
+    return View(name, shown, "radiance")
 
 
 def _layers(path: Path) -> dict[str, np.ndarray]:

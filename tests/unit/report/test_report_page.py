@@ -106,6 +106,18 @@ def test_runs_have_curves_and_differences(tmp_path):
     assert data["views"][0]["layers"] == ["initial", "final", "target", "final − target", "initial − target"]
 
 
+def test_an_interrupted_run_shows_its_snapshots(tmp_path):
+    (tmp_path / "snapshots").mkdir()
+    for k in range(3):
+        layers = {"image_left_eye": noise(k), "target_left_eye": noise(9)}
+        images.write_exr(tmp_path / "snapshots" / f"{k:06d}.exr", layers)
+    (view,) = sources.read(tmp_path).views
+    found = {layer.name: layer.image for layer in view.layers}
+    assert view.name == "left_eye" and list(found)[:3] == ["initial", "final", "target"]
+    for name, k in (("initial", 0), ("final", 2), ("target", 9)):
+        assert np.allclose(found[name], noise(k), rtol=1e-6)
+
+
 def test_what_is_no_result_is_refused(tmp_path, capsys):
     (tmp_path / "a.exr").write_bytes(b"no image")
     for path, words in ((tmp_path, "log.jsonl"), (tmp_path / "b.exr", "no file"), (tmp_path / "a.exr", "OpenEXR")):
