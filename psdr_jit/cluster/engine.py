@@ -7,6 +7,7 @@ it is the same. What cannot be mended so is a typed error.
 from __future__ import annotations
 
 import gc
+import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from psdr_jit.scene.names import traverse
 
 LOOPBACK = "127.0.0.1"
 PATIENCE = 60.0  # seconds to wait for a first worker
+SMALL = 1 << 17  # bytes of a scene's state that travel with every unit of work
 
 #: Digests of the parameters of files as they are, by variant and digest of the file.
 _AS_LOADED: dict[tuple[str, str], dict[str, bytes]] = {}
@@ -89,8 +91,10 @@ class Engine:
     def update(self, values: Values) -> None:
         """Let units see these values of parameters from now on."""
         place = replace(self._at_first, values={**self._at_first.values, **values})
-        # a task, not scattered data: where the worker that has it dies, Dask makes it anew
-        self._place = self.client.submit(_same, place, pure=False)
+        # With every unit, or, if large, once to each worker: as a task, not as scattered data, since Dask makes it anew
+        # where the worker that has it dies. It then prefers workers that have it, and takes a while to use all of them.
+        small = len(pickle.dumps(place)) <= SMALL
+        self._place = place if small else self.client.submit(_same, place, pure=False)
 
     @property
     def workers(self) -> int:

@@ -19,6 +19,7 @@ from clusters import BOX, FILE, RES
 
 import psdr_jit
 from psdr_jit.cli.main import main
+from psdr_jit.cluster import engine
 from psdr_jit.derivative import images
 from psdr_jit.errors import ClusterError, OptionError, SceneError, UnsupportedWarning
 
@@ -41,14 +42,14 @@ def here(scene) -> psdr_jit.GradientResult:
     return psdr_jit.gradient(scene, BOX, **MOVE)
 
 
-def test_two_workers_give_what_this_process_gives(scene, source, two, here):
+@pytest.mark.parametrize("small", [engine.SMALL, 0])
+def test_two_workers_give_what_this_process_gives(scene, source, two, here, small, monkeypatch):
+    """Also where the state of the scene is a task of its own."""
+    monkeypatch.setattr(engine, "SMALL", small)
     assert_same(here, psdr_jit.gradient(scene, BOX, **MOVE, client=two, source=source))
 
 
-def test_one_worker_as_well(scene, source, here):
-    pytest.importorskip("distributed")
-    from psdr_jit.cluster import engine
-
+def test_one_worker_as_well(scene, source, two, here):
     with engine.local(1) as client:
         assert_same(here, psdr_jit.gradient(scene, BOX, **MOVE, client=client, source=source))
 
