@@ -52,6 +52,7 @@ def local(workers: int) -> Iterator[Any]:
     cluster = distributed.LocalCluster(
         n_workers=workers, threads_per_worker=1, processes=True, host=LOOPBACK, dashboard_address=f"{LOOPBACK}:0",
         silence_logs=50,  # what goes wrong is raised
+        preload=["psdr_jit.cluster.preload"],
         env={worker.THREADS: str(max(worker.LEAST_THREADS, dr.thread_count() // workers))},
     )  # fmt: skip
     with cluster, distributed.Client(cluster) as client:

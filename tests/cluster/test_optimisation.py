@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,22 @@ RES = {"res": 16}
 BUDGETS = {"type": "psdr_path", "max_depth": 2, "sppc": 4, "sppp": 4, "sppi": 4}
 SHADOW = str(scene_io.shipped_scene("point_shadow.xml"))
 SHADOW_RES = {"res": 16, "max_depth": 2}
+TOML = f'scene = "{SHADOW}"\nspp = 4\n' + """iterations = {iterations}
+[defaults]
+res = 16
+[integrator]
+max_depth = 2
+sppc = 4
+sppp = 4
+sppi = 4
+[[target]]
+render = 16
+[[variable]]
+kind = "parameter"
+parameter = "lamp.intensity.value"
+learning_rate = 0.1
+start_at = 8.0
+"""
 ROUNDING = 1e-4  # of losses and offsets after some steps
 
 
@@ -130,25 +147,31 @@ def test_a_lost_scheduler_leaves_a_checkpoint(tmp_path: Path, two):
 def test_command_line(tmp_path: Path, monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.chdir(tmp_path)
-    text = f'scene = "{SHADOW}"\niterations = 3\nspp = 4\n' + """
-[defaults]
-res = 16
-[integrator]
-max_depth = 2
-sppc = 4
-sppp = 4
-sppi = 4
-[[target]]
-render = 16
-[[variable]]
-kind = "parameter"
-parameter = "lamp.intensity.value"
-learning_rate = 0.1
-start_at = 8.0
-"""
-    Path("a.toml").write_text(text, encoding="utf-8")
+    Path("a.toml").write_text(TOML.format(iterations=3), encoding="utf-8")
     found = []
     for extra in ([], ["--workers", "2"]):
         assert main(["optimize", "a.toml", "--out", f"out{len(found)}", *extra]) == 0
         found.append(capsys.readouterr().out.splitlines()[1])
     assert found[0] == found[1] and "lamp.intensity.value" in found[0]
+
+
+def test_ctrl_c_ends_the_run_in_order(tmp_path: Path):
+    """A terminal interrupts the workers, too; they leave it to the process that has asked."""
+    pytest.importorskip("distributed")
+    (tmp_path / "a.toml").write_text(TOML.format(iterations=100000), encoding="utf-8")
+    command = [sys.executable, "-m", "psdr_jit.cli.main", "optimize", "a.toml", "--workers", "2", "--out", "run"]
+    log = tmp_path / "run" / "log.jsonl"
+    run = subprocess.Popen(command, cwd=tmp_path, start_new_session=True, stdout=subprocess.PIPE,
+                           stderr=subprocess.STDOUT, text=True)  # fmt: skip
+    try:
+        deadline = time.monotonic() + 120
+        while not (log.is_file() and len(log.read_text().splitlines()) > 3):
+            assert time.monotonic() < deadline and run.poll() is None
+            time.sleep(0.2)
+        os.killpg(run.pid, signal.SIGINT)
+        said, _ = run.communicate(timeout=60)
+    finally:
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
+    assert run.returncode == 130 and "go on with --resume" in said and "Traceback" not in said, said
+    assert (tmp_path / "run" / "checkpoint.npz").is_file()
