@@ -72,6 +72,7 @@ function chart(title, curves, iterations) {
   const head = document.createElement("div");
   head.className = "bar";
   head.append(cell("h2", title), cell("span", ""));
+  head.firstChild.title = title;
   head.lastChild.className = "muted";
   box.append(head, svg);
   if (curves.length > 1) box.append(legend(curves));

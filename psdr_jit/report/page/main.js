@@ -4,7 +4,7 @@ const SHOWN = { value: "value", error: "standard error", ratio: "value ÷ error"
 const CHANNELS = { mean: "mean", 0: "R", 1: "G", 2: "B" };
 const RATIO_LIMIT = 6;  // standard errors: beyond, nobody doubts
 const NEAR = 0.03;      // of the width of a pane, from the divider
-const state = { view: 0, layer: "", show: "value", channel: "mean", zoomed: 0, left: "", right: "", split: 0.5, exposure: 0, pixel: null, pinned: false, limit: 1 };
+const state = { view: 0, layer: "", show: "value", channel: "mean", zoomed: 0, left: "", right: "", split: 0.5, exposure: 0, pixel: null, pinned: false, limit: 1, chips: 1 };
 const wanted = new URLSearchParams(location.hash.slice(1));
 const images = {};  // canvases of the film's size, by pane
 let views = [];
@@ -59,6 +59,7 @@ function paintSigned() {
   if (!state.layer) return;
   const { plane, kind } = chosenPlane();
   state.limit = commonLimit() * 10 ** state.zoomed;
+  state.chips = kind === "signed" && state.show === "value" ? state.limit : view().limits.mean || state.chips;
   images.signed = [signedCanvas(view(), plane, kind, state.limit)];
   const beyond = plane.reduce((count, x) => count + (Math.abs(x) > state.limit), 0) / plane.length;
   drawScale(kind, state.limit, state.show === "ratio" ? "standard errors" : view().unit, beyond);

@@ -138,6 +138,7 @@ function drawScale(kind, limit, unit, beyond) {
     const mark = document.createElement("span");
     mark.style.left = `${(100 * (x - low)) / (limit - low)}%`;
     mark.textContent = tickText(x, marks);
+    if (x === low) mark.className = "first";
     return mark;
   }));
   element("unit").textContent = unit;

@@ -34,7 +34,7 @@ function chip(layer, at, limit) {
 function row(layer, at, state, choose) {
   const made = document.createElement("tr");
   const head = cell("td", "");
-  head.append(chip(layer, at, state.limit), layer.name);
+  head.append(chip(layer, at, state.chips), layer.name);
   made.append(head);
   layer.value.forEach((plane, c) => made.append(valueCell(layer, c, plane, layer.stderr && layer.stderr[c], at)));
   if (layer.value.length > 1) made.append(valueCell(layer, "mean", layer.mean, layer.meanStderr, at));
