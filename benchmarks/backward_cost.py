@@ -23,8 +23,8 @@ import numpy as np
 
 from benchmarks import rows
 from benchmarks.measure import measured
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.scene import io as scene_io
 
 BENCH = "backward_cost"

@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmarks import rows
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.scene import io as scene_io
 
 BENCH = "convergence"

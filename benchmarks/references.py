@@ -19,7 +19,7 @@ from benchmarks.cases import Case
 from benchmarks.figures import Reference
 from benchmarks.methods import OURS, Problem
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.derivative.gradient import DerivativeSampler
+from psdr_jit.derivative.sampler import DerivativeSampler
 
 SPP = 64
 FIRST_SEED = 1 << 20

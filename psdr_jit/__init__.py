@@ -13,7 +13,7 @@ Symbols of the papers, and what they are called in the code (`_d`: attached to t
 Data flows one way, through the rooms (folders) in this order; each imports from those before it only:
 
     setup → core → scene → paths → plan → edges → sampling → interior, boundary → driver → plugins
-    → derivative → inverse → cli
+    → cluster → derivative → inverse → report → cli
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
 
 if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is wrong
     from . import plugins as plugins  # registers the integrators, now and after every variant switch
+    from .cluster.source import SceneFile
     from .derivative.check import CheckResult, check_gradient
     from .derivative.gradient import GradientResult, gradient
     from .derivative.make_plan import make_plan
@@ -46,6 +47,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "Plan",
         "Pose",
         "Profile",
+        "SceneFile",
         "Vertices",
         "check_gradient",
         "differentiable_params",

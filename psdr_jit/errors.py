@@ -57,3 +57,7 @@ class LockedError(PsdrError, RuntimeError):
 
 class StalledWarning(UserWarning):
     """A variable has had no gradient for several iterations; the message says why."""
+
+
+class ClusterError(PsdrError, RuntimeError):
+    """Other processes or machines cannot do their part: they are gone, full, or have other packages."""

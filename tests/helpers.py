@@ -11,8 +11,8 @@ from problems import Problem
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.scene import io as scene_io
 
 Z_LIMIT = 6.0  # standard errors, of few samples: thousands of comparisons with heavy tails

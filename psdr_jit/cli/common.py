@@ -1,16 +1,13 @@
-"""What the subcommands share: argument types, progress on the terminal, Mitsuba's own chatter."""
+"""What the subcommands share: argument types, the scene, the integrator, the workers."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from psdr_jit.errors import OptionError
-
-PATIENCE = 2.0  # seconds before a progress bar appears
 
 
 def vector(text: str) -> tuple[float, float, float]:
@@ -51,42 +48,42 @@ def add_integrator_argument(parser: argparse.ArgumentParser) -> None:
                         help="psdr_path or psdr_bdpt (default: the scene's own, or psdr_path)")
 
 
+def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """Who renders: for commands whose work can be handed out."""
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument("--workers", type=int, metavar="N", help="render in N processes of this machine, by Dask")
+    who.add_argument("--scheduler", metavar="ADDRESS",
+                     help="render with the workers of a Dask scheduler, such as tcp://10.0.0.1:8786")
+    parser.add_argument("--send", action="store_true",
+                        help="let scene, meshes and textures travel to workers that do not share the folder")
+
+
+@contextmanager
+def cluster(args: argparse.Namespace) -> Iterator[Any]:
+    """A Dask client as asked for, or None: this process renders."""
+    if args.workers is None and args.scheduler is None:
+        yield None
+        return
+    from psdr_jit.cluster import engine
+
+    require_positive(workers=args.workers)
+    with engine.local(args.workers) if args.workers else engine.connected(args.scheduler) as client:
+        yield client
+
+
+def source(args: argparse.Namespace) -> Any:
+    """Where workers find the scene."""
+    from psdr_jit.cluster.source import SceneFile
+
+    return SceneFile(args.scene, definitions(args), args.send)
+
+
 def definitions(args: argparse.Namespace) -> dict[str, str]:
     """The -D options as a dictionary."""
     for item in args.define:
         if "=" not in item:
             raise OptionError(f"-D {item}: expected NAME=VALUE")
     return dict(item.split("=", 1) for item in args.define)
-
-
-@contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[float, float, str], None]]:
-    """Yields `report(done, total, note)`. The bar goes to stderr, and only if the work takes a while."""
-    import time
-
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    start = time.perf_counter()
-    console = Console(file=sys.stderr)
-    columns = (TextColumn(label), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
-               TextColumn("{task.fields[note]}"))
-    bar = Progress(*columns, console=console, transient=not console.is_terminal)
-    task = bar.add_task(label, total=1.0, note="")
-    started = False
-
-    def report(done: float, total: float, note: str = "") -> None:
-        nonlocal started
-        if not quiet and not started and time.perf_counter() - start > PATIENCE:
-            bar.start()
-            started = True
-        bar.update(task, completed=min(1.0, done / total), note=note)
-
-    try:
-        yield report
-    finally:
-        if started:
-            bar.stop()
 
 
 def integrator_of(args: argparse.Namespace, scene: Any) -> dict[str, Any]:

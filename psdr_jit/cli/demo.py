@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import common
+from psdr_jit.core import progress
 from psdr_jit.errors import OptionError
 
 NAME = "demo"
@@ -69,7 +70,7 @@ def show_gradient(args: argparse.Namespace, scene: Any, out: Path) -> None:
     from psdr_jit.cli import demo_run
     from psdr_jit.derivative import images
 
-    with common.progress_bar("gradient ", args.quiet) as report:
+    with progress.bar("gradient ", args.quiet) as report:
         result, reference = demo_run.compare(scene, args.integrator, progress=report)
     panels = [("primal", "Cornell box", result.primal),
               ("derivative", f"box moved in x: {' + '.join(result.terms) or 'total'}", result.total),
@@ -93,7 +94,7 @@ def show_recovery(args: argparse.Namespace, scene: Any, out: Path) -> None:
         return (f"loss {history.losses[k]:.5f}, off by {history.shift_px(k):.1f} px "
                 f"and {history.angle_degrees(k):.1f} degrees")
 
-    with common.progress_bar("recovery ", args.quiet) as report:
+    with progress.bar("recovery ", args.quiet) as report:
         history = demo_run.recover_pose(scene, args.integrator, args.iterations,
                                     progress=lambda done, total, h: report(done, total, note(h)))
     png = images.write_panels(out / "recovery.png", [("primal", "target", history.target),

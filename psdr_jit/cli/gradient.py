@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check-seconds", type=float, default=120, metavar="S",
                         help="time limit of the check (default: 120)")
     common.add_integrator_argument(parser)
+    common.add_cluster_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="print only errors and the check's verdict")
 
 
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     """Render, write, check; 0, or 1 for a check that did not pass."""
     common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
                              check_seconds=args.check_seconds)
-    from psdr_jit.derivative import images, integrator_specs
+    from psdr_jit.derivative import integrator_specs
     from psdr_jit.derivative.gradient import gradient
     from psdr_jit.derivative.perturbation import perturb
     from psdr_jit.scene import io as scene_io
@@ -59,15 +60,23 @@ def run(args: argparse.Namespace) -> int:
     scene_io.check_sensor(scene, args.sensor)
     spec = common.integrator_of(args, scene)
     parameter = perturb(scene, args.wrt, args.direction, rotate=args.rotate, index=args.index)
-    with common.progress_bar("gradient", args.quiet) as report:
-        result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds,
-                          sensor=args.sensor, progress=report)
+    with common.cluster(args) as client:
+        who = {} if client is None else {"client": client, "source": common.source(args)}
+        result = gradient(scene, parameter, integrator=spec, spp=args.spp, seeds=args.seeds, sensor=args.sensor,
+                          progress=not args.quiet, **who)
+        write(args, result, exr, png)
+        return check(args, scene, parameter, integrator_specs.integrator_spec(scene, spec), who) if args.check else OK
+
+
+def write(args: argparse.Namespace, result: Any, exr: Path, png: Path) -> None:
+    """The files, and what is in them."""
+    from psdr_jit.derivative import images
+
     images.write_exr(exr, result.layers(), result.metadata())
     title = f"d image / d {result.param}\n{result.direction}"
     images.write_derivative_png(png, result.total, title)
     if not args.quiet:
         print(describe(result, exr, png))
-    return check(args, scene, parameter, integrator_specs.integrator_spec(scene, spec)) if args.check else OK
 
 
 def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
@@ -86,14 +95,11 @@ def describe(result: Any, exr: Path, png: Path) -> str:
     return f"{result}\nwrote {exr} and {png}"
 
 
-def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any]) -> int:
+def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any], who: dict[str, Any]) -> int:
     """Run the check and print its verdict."""
     from psdr_jit.derivative.check import check_gradient
 
-    limit = args.check_seconds
-    with common.progress_bar("check", args.quiet) as report:
-        result = check_gradient(
-            scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor, max_seconds=limit,
-            progress=lambda t, v: report(t, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}"))
+    result = check_gradient(scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor,
+                            max_seconds=args.check_seconds, progress=not args.quiet, **who)
     print(result)
     return OK if result.passed else CHECK_FAILED

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psdr_jit
-from psdr_jit.errors import PsdrError, SetupError, StorageError
+from psdr_jit.errors import ClusterError, PsdrError, SetupError, StorageError
 
 OK, USAGE, SETUP_MISSING, UNFORESEEN, INTERRUPTED = 0, 2, 3, 3, 130
 TRACEBACK_VARIABLE = "PSDR_TRACEBACK"
@@ -41,6 +41,7 @@ COMMANDS = {
     ),
     "optimize": Command("psdr_jit.cli.optimize", "recover parameters of a scene from images", renders=True),
     "plan": Command("psdr_jit.cli.plan", "show what differentiating a scene would compute, and why", renders=True),
+    "report": Command("psdr_jit.cli.report", "make one HTML page of a derivative or an optimisation", renders=False),
     "params": Command("psdr_jit.cli.params", "list the parameters of a scene", renders=True),
     "demo": Command("psdr_jit.cli.demo", "run the bundled scenes and show their gradients", renders=True),
     "doctor": Command("psdr_jit.cli.doctor", "check Python, Mitsuba, Dr.Jit and LLVM", renders=False),
@@ -133,7 +134,7 @@ def explained(error: BaseException) -> tuple[int, str]:
         if isinstance(found, KeyboardInterrupt):
             return INTERRUPTED, "interrupted"
         if isinstance(found, PsdrError):
-            lacking = isinstance(found, (SetupError, StorageError))
+            lacking = isinstance(found, (ClusterError, SetupError, StorageError))
             return SETUP_MISSING if lacking else USAGE, f"error: {found}"
         if isinstance(found, MemoryError) or "out of memory" in str(found):
             return SETUP_MISSING, "error: out of memory: use fewer samples per pixel, or a smaller image"

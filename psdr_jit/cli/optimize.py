@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psdr_jit.cli import common
+from psdr_jit.core import progress
 from psdr_jit.errors import OptionError, StorageError
 
 NAME = "optimize"
@@ -33,14 +34,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
     )
+    common.add_cluster_arguments(parser)
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="print only errors and warnings")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check, optimise, report."""
+    from psdr_jit.cluster.source import SceneFile
     from psdr_jit.inverse import config as configs
     from psdr_jit.inverse import loop
+    from psdr_jit.inverse.remote import with_crew
     from psdr_jit.scene import io as scene_io
 
     common.require_positive(iterations=args.iterations, max_seconds=args.max_seconds)
@@ -56,7 +60,10 @@ def run(args: argparse.Namespace) -> int:
     loop.require_folder(out, args.resume)  # before targets are rendered
     problem = configs.problem_of(config)
     start = time.perf_counter()
-    with common.progress_bar("optimize", args.quiet) as report:
+    with common.cluster(args) as client, progress.bar("optimize", args.quiet) as report:
+        if client is not None:
+            source = SceneFile(str(config.scene), dict(config.defaults), args.send)
+            problem = with_crew(problem, client, source, config.integrator)
         result = loop.run(problem, out, args.resume, report)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))

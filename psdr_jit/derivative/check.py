@@ -8,19 +8,25 @@ root mean square z-score of pixel blocks, and the largest |z|. A gradient of 0, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from numbers import Real
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.cluster.engine import Engine
+from psdr_jit.cluster.source import SceneFile
+from psdr_jit.core.progress import Report, reporting
 from psdr_jit.core.threads import one_at_a_time
-from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative import integrator_specs, show
 from psdr_jit.derivative.finite_differences import CentralDifference, default_block
-from psdr_jit.derivative.gradient import DerivativeSampler, differentiable
 from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.remote import RemoteDifference, RemoteSampler
+from psdr_jit.derivative.sampler import DerivativeSampler, differentiable
 from psdr_jit.derivative.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
 from psdr_jit.errors import OptionError
 from psdr_jit.options import require_count
@@ -71,6 +77,12 @@ class CheckResult:
     @property
     def passed(self) -> bool:
         return self.verdict.verdict == PASS
+
+    def _repr_png_(self) -> bytes:
+        return show.check_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.check_html(self)
 
     def __str__(self) -> str:
         v = self.verdict
@@ -171,14 +183,16 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
                    eps: float | None = None, reference_spp: int | None = None, block: int | None = None,
                    tolerance: float = 0.02, max_stderr: float = 0.007, max_seconds: float = 120.0,
                    zero_bound: float | None = None,
-                   progress: Callable[[float, Verdict], None] | None = None) -> CheckResult:
+                   progress: Callable[[float, Verdict], None] | bool | None = None, client: Any = None,
+                   source: SceneFile | str | None = None) -> CheckResult:
     """Compare forward-mode derivatives with central differences until the verdict is certain or time is up.
 
     The reference is Mitsuba's `path` with the max_depth, rr_depth and hide_emitters of `integrator`. Seeds go
     to whichever of the two lowers the error of the gain more per second. Only terms of the estimate that are
     implemented are in it: where others matter, the check fails, and should.
 
-    `progress(seconds, verdict)` is called after every batch of seeds.
+    `progress(seconds, verdict)` is called after every batch of seeds; True shows a bar, None does so in notebooks.
+    `client`, `source`: as in `gradient`.
     """
     _require_sane(sensor, counts=dict(spp=spp, reference_spp=reference_spp, block=block),
                   reals=dict(eps=eps, max_seconds=max_seconds, tolerance=tolerance, max_stderr=max_stderr,
@@ -192,26 +206,44 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
         spec = integrator_specs.integrator_spec(scene, integrator)
         tested, terms = differentiable(spec), integrator_specs.terms_of(spec)
     start = time.perf_counter()
-    estimate = DerivativeSampler(param, tested, sensor, spp)
-    reference = CentralDifference(param, spec, sensor, reference_spp, eps)
+    difference: Callable[..., CentralDifference] = CentralDifference
+    if client is None:
+        estimate = DerivativeSampler(param, tested, sensor, spp)
+    else:
+        engine = Engine(client, scene, source)
+        estimate = RemoteSampler(engine, param, tested if tested is integrator else spec, sensor, spp)
+        difference = partial(RemoteDifference, engine)
+    reference = difference(param, spec, sensor, reference_spp, eps)
     rule = dict(tolerance=tolerance, max_stderr=max_stderr, zero_bound=zero_bound)
-    try:
-        verdict, block = _collect(estimate, reference, block, start, start + max_seconds, progress, rule)
+    with reporting("check", progress, partial(_noted, max_seconds)) as report, _restored(param):
+        verdict, block = _collect(estimate, reference, block, start, start + max_seconds, report, rule)
         # Differences across a kink (an edge that meets the corner of a pixel block) are biased by O(eps), not
         # O(eps^2): a failure is believed only if it is gross, or if a smaller step does not cure it.
         for _ in range(REFINEMENTS if eps is None else 0):
             if verdict.verdict != FAIL or not abs(verdict.gain - 1) < GROSS:
                 break
-            finer = CentralDifference(param, spec, sensor, reference_spp, reference.eps / 4)
-            retry, block = _collect(estimate, finer, block, start, start + max_seconds, progress, rule)
+            finer = difference(param, spec, sensor, reference_spp, reference.eps / 4)
+            retry, block = _collect(estimate, finer, block, start, start + max_seconds, report, rule)
             if retry.verdict == INCONCLUSIVE:
                 break
             verdict, reference = retry, finer
-    finally:
-        param.restore()
     return CheckResult(verdict, estimate.seeds, 2 * reference.seeds, spp, reference.spp, reference.eps, block,
                        time.perf_counter() - start, tuple(terms) or ("all of the given integrator",),
                        param.name, param.label, estimate.images.mean(), reference.result(block).mean)
+
+
+def _noted(limit: float, report: Report) -> Callable[[float, Verdict], None]:
+    """What `_collect` calls, for a bar."""
+    return lambda seconds, v: report(seconds, limit, f"gain {v.gain:.3f} +- {v.gain_stderr:.3f}")
+
+
+@contextmanager
+def _restored(param: Perturbation) -> Iterator[None]:
+    """Leaves the scene as it was found."""
+    try:
+        yield
+    finally:
+        param.restore()
 
 
 def _require_sane(sensor: Any, counts: dict[str, Any], reals: dict[str, Any]) -> None:
@@ -232,7 +264,7 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
     for sampler in (estimate, reference):
         # two are needed for any statement at all, the rest only while there is time
         while sampler.seeds < 2 or (sampler.seeds < MIN_SEEDS and time.perf_counter() < deadline):
-            sampler.add(2)
+            sampler.add(max(2, sampler.at_once))
     size = estimate.images.mean().shape
     if block is not None and block > min(size[:2]):
         raise OptionError(f"block = {block} is larger than the image, {size[1]} x {size[0]} px")
@@ -250,7 +282,7 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
             sampler = estimate if estimate.seeds < reference.seeds else reference
         rate = sampler.seconds / sampler.seeds
         # growing batches keep the share of bookkeeping constant, short enough not to miss the deadline
-        sampler.add(int(np.clip(min(sampler.seeds // 3, (deadline - now) / rate), 1, 256)))
+        sampler.add(int(np.clip(min(sampler.seeds // 3, (deadline - now) / rate), sampler.at_once, 256)))
 
 
 def _most_useful(estimate: DerivativeSampler, reference: CentralDifference) -> Any:

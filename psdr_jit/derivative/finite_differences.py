@@ -73,6 +73,9 @@ class CentralDifference:
         self.seconds = 0.0
         self._next_seed = FD_SEED
 
+    #: Seeds that are rendered at the same time.
+    at_once = 1
+
     @property
     def seeds(self) -> int:
         """Seeds per half so far."""

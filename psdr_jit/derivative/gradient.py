@@ -6,20 +6,25 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from psdr_jit.core.film import require_samples
+from psdr_jit.cluster.engine import Engine
+from psdr_jit.cluster.source import SceneFile
+from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
-from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative import show
 from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.remote import RemoteTerms
+from psdr_jit.derivative.sampler import PRIMAL, TOTAL, DerivativeSampler, Terms
 from psdr_jit.derivative.statistics import GroupedImages
 from psdr_jit.errors import OptionError
 from psdr_jit.options import require_count
 from psdr_jit.scene.io import find_sensor
+
+__all__ = ["DerivativeSampler", "GradientResult", "gradient"]  # the first has its place in `sampler`
 
 MAX_GROUPS = 64     # images kept for the standard errors; more seeds share a group
 
@@ -62,6 +67,12 @@ class GradientResult:
             lines.append(f"  {self.rejected} samples were not finite and were dropped")
         return "\n".join(lines)
 
+    def _repr_png_(self) -> bytes:
+        return show.gradient_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.gradient_html(self)
+
     def metadata(self) -> dict[str, str]:
         """What was computed, as strings for an image header."""
         options = " ".join(f"{k}={v}" for k, v in self.integrator.items())
@@ -76,49 +87,11 @@ def _line(name: str, image: np.ndarray, stderr: np.ndarray) -> str:
     return f"  {name:9s} mean {image.mean(): .4e}   rms {np.sqrt((image**2).mean()):.4e}{known}"
 
 
-class DerivativeSampler:
-    """Adds independent seeds to a derivative image, as many as one asks for."""
-
-    def __init__(self, perturbation: Perturbation, integrator: Any, sensor: Any = 0, spp: int = 64,
-                 groups: int = 32, first_seed: int = 0) -> None:
-        self.perturbation = perturbation
-        self.integrator = integrator
-        self.sensor = find_sensor(perturbation.scene, sensor)
-        require_samples(self.sensor, spp)
-        self.spp = spp
-        self.images = GroupedImages(groups)
-        self.not_finite = 0     # pixel values that arrived as NaN or inf
-        self.seconds = 0.0
-        self._next_seed = first_seed
-
-    @property
-    def seeds(self) -> int:
-        return self.images.total
-
-    def render(self, seed: int) -> np.ndarray:
-        """The derivative image (H, W, C) of one seed; non-finite values become 0 and are counted."""
-        # attached anew for each seed: rendering uses the tangents in the scene up
-        self.perturbation.attach()
-        image = self.integrator.render_forward(self.perturbation.scene, self.perturbation.params,
-                                               sensor=self.sensor, seed=seed, spp=self.spp)
-        image = integrator_specs.to_image(dr.detach(image))
-        bad = ~np.isfinite(image)
-        self.not_finite += int(bad.sum())
-        return np.where(bad, 0.0, image)
-
-    def add(self, seeds: int) -> None:
-        start = time.perf_counter()
-        for _ in range(seeds):
-            self.images.add(self.render(self._next_seed))
-            self._next_seed += 1
-        self.perturbation.restore()
-        self.seconds += time.perf_counter() - start
-
-
 @one_at_a_time
 def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, rotate: Any = None,
              index: int | None = None, integrator: Any = None, spp: int = 64, seeds: int = 8, sensor: int = 0,
-             progress: Callable[[int, int], None] | None = None) -> GradientResult:
+             progress: Callable[[int, int], None] | bool | None = None, client: Any = None,
+             source: SceneFile | str | None = None) -> GradientResult:
     """d(image)/d(theta) for `param` moved along a direction, in forward mode.
 
     `param`, `direction`, `rotate`, `index` as in `perturb`. `integrator`: an instantiated integrator (total
@@ -127,6 +100,9 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
 
     Every one of the `seeds` is an independent image with `spp` samples per pixel and term; the standard
     errors come from their scatter. The scene is left as it was found.
+    `progress(done, total)` is called after every seed; True shows a bar, None does so in notebooks.
+    `client`: a `distributed.Client`, whose workers then render; `source`: the file that the scene was loaded from. The
+    numbers are the same for any number of workers, and with none.
     """
     require_count("spp", spp)
     require_count("seeds", seeds)
@@ -134,64 +110,32 @@ def gradient(scene: Any, param: str | Perturbation, direction: Any = None, *, ro
         raise OptionError(f"spp and seeds must be positive, got spp={spp}, seeds={seeds}")
     if not isinstance(param, Perturbation):
         param = perturb(scene, param, direction, rotate=rotate, index=index)
-    view = find_sensor(scene, sensor)
+    find_sensor(scene, sensor)
     start = time.perf_counter()
-    samplers, primal_integrator, spec = _samplers(scene, param, integrator, sensor, spp,
-                                                 min(seeds, MAX_GROUPS))
-    total, primal = GroupedImages(min(seeds, MAX_GROUPS)), GroupedImages(1)
-    try:
-        for seed in range(seeds):
-            with dr.suspend_grad():
-                image = primal_integrator.render(scene, view, seed=seed, spp=spp)
-            primal.add(integrator_specs.to_image(image))
-            images = [s.render(seed) for s in samplers.values()]
-            for s, image in zip(samplers.values(), images, strict=True):
-                s.images.add(image)
-            total.add(sum(images))
-            if progress is not None:
-                progress(seed + 1, seeds)
-    finally:
-        param.restore()
-    lost = _report_not_finite(samplers)
-    counts = [integrator_specs.rejected(s.integrator) for s in samplers.values()]
-    terms = {k: s for k, s in samplers.items() if k != "total"}
+    given = Terms if client is None else partial(RemoteTerms, Engine(client, scene, source))
+    terms = given(param, integrator, sensor, spp)
+    groups = min(seeds, MAX_GROUPS)
+    primal, total = GroupedImages(1), GroupedImages(groups)
+    each = {name: GroupedImages(groups) for name in terms.names}
+    with reporting("gradient", progress) as report:
+        for seed, images in enumerate(terms.images(seeds)):
+            primal.add(images.pop(PRIMAL))
+            for name, image in images.items():
+                each[name].add(image)
+            total.add(sum(images.values()))
+            if report is not None:
+                report(seed + 1, seeds)
+    lost = _report_not_finite(terms.not_finite)
+    each.pop(TOTAL, None)
     return GradientResult(
         primal=primal.mean(), total=total.mean(), total_stderr=total.stderr(),
-        terms={k: s.images.mean() for k, s in terms.items()},
-        term_stderr={k: s.images.stderr() for k, s in terms.items()},
-        rejected=None if None in counts else sum(counts) + lost, spp=spp, seeds=seeds,
-        seconds=time.perf_counter() - start, param=param.name, direction=param.label, integrator=spec)
+        terms={name: images.mean() for name, images in each.items()},
+        term_stderr={name: images.stderr() for name, images in each.items()},
+        rejected=None if terms.rejected is None else terms.rejected + lost, spp=spp, seeds=seeds,
+        seconds=time.perf_counter() - start, param=param.name, direction=param.label, integrator=terms.spec)
 
 
-def _samplers(scene: Any, param: Perturbation, integrator: Any, sensor: int, spp: int,
-              groups: int) -> tuple[dict[str, DerivativeSampler], Any, dict[str, Any]]:
-    """One sampler for each term (or one named 'total'), the integrator of the primal image, and the spec."""
-    if hasattr(integrator, "render_forward"):
-        spec = {"type": str(integrator).split("[")[0], **integrator_specs.path_options(integrator)}
-        return {"total": DerivativeSampler(param, integrator, sensor, spp, groups)}, integrator, spec
-    spec = integrator_specs.integrator_spec(scene, integrator)
-    whole = differentiable(spec)
-    terms = integrator_specs.terms_of(spec)
-    if not terms:
-        return {"total": DerivativeSampler(param, whole, sensor, spp, groups)}, whole, spec
-    samplers = {t: DerivativeSampler(param, integrator_specs.build_term(spec, t), sensor, spp, groups)
-                for t in terms}
-    for sampler in samplers.values():
-        if hasattr(whole, "memory"):
-            sampler.integrator.memory = whole.memory      # edge tables, and what has been warned about
-    return samplers, whole, spec
-
-
-def differentiable(spec: dict[str, Any]) -> Any:
-    """Instantiate `spec`, which must be an integrator."""
-    built = integrator_specs.build(spec)
-    if not isinstance(built, mi.Integrator):
-        raise OptionError(f"'{spec['type']}' is a {type(built).__name__}, not an integrator")
-    return built
-
-
-def _report_not_finite(samplers: dict[str, DerivativeSampler]) -> int:
-    lost = {k: s.not_finite for k, s in samplers.items() if s.not_finite}
+def _report_not_finite(lost: dict[str, int]) -> int:
     if lost:
         warnings.warn(f"derivative pixels that were not finite counted as 0: {lost}", RuntimeWarning,
                       stacklevel=3)

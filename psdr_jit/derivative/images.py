@@ -6,6 +6,7 @@ Files are written beside their destination and renamed, so a reader never meets 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -95,6 +96,14 @@ def read_exr(path: str | os.PathLike) -> dict[str, np.ndarray]:
         return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
 
 
+def read_metadata(path: str | os.PathLike) -> dict[str, str]:
+    """What `write_exr` was given as metadata."""
+    import OpenEXR
+
+    with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+        return {key.removeprefix("psdr_"): str(v) for key, v in file.header().items() if key.startswith("psdr_")}
+
+
 def write_derivative_png(path: str | os.PathLike, image: np.ndarray, title: str = "",
                          unit: str = "radiance per unit") -> Path:
     """Write one derivative image (H, W, C) in red (positive) and blue (negative) with a colour bar."""
@@ -103,7 +112,13 @@ def write_derivative_png(path: str | os.PathLike, image: np.ndarray, title: str 
 
 def write_panels(path: str | os.PathLike, panels: Sequence[tuple[str, str, np.ndarray]],
                  unit: str = "radiance per unit") -> Path:
-    """Write images side by side: each panel is (kind, title, image), kind `primal` or `derivative`.
+    """Write `panels_figure` as PNG."""
+    return save_figure(path, panels_figure(panels, unit))
+
+
+def panels_figure(panels: Sequence[tuple[str, str, np.ndarray]], unit: str = "radiance per unit",
+                  columns: int | None = None) -> Any:
+    """Images side by side, in rows of `columns`: each panel is (kind, title, image), kind `primal` or `derivative`.
 
     Derivatives show the mean of their channels; all of them share one symmetric scale, set by a percentile
     so that a few noisy pixels do not wash out the rest.
@@ -113,21 +128,35 @@ def write_panels(path: str | os.PathLike, panels: Sequence[tuple[str, str, np.nd
     derivatives = [grey(image) for kind, _, image in panels if kind == "derivative"]
     limit = robust_limit(derivatives) if derivatives else 1.0
     # Figure instead of pyplot: no global state, no display
-    figure = Figure(figsize=(3.6 * len(panels) + 0.9, 3.9), dpi=120, layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    columns = min(columns or len(panels), len(panels))
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.6 * columns + 0.9, 3.9 * rows), dpi=120, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     shown = None
-    for axis, (kind, title, image) in zip(axes, panels, strict=True):
-        axis.set_title(title, fontsize=9)
+    for axis in axes:
         axis.set_axis_off()
+    for axis, (kind, title, image) in zip(axes, panels, strict=False):
+        axis.set_title(title, fontsize=9)
         if kind == "primal":
             axis.imshow(srgb(image), interpolation="nearest")
         else:
             shown = axis.imshow(grey(image), cmap=COLOUR_MAP, vmin=-limit, vmax=limit,
                                 interpolation="nearest")
     if shown is not None:
-        derivative_axes = [a for a, p in zip(axes, panels, strict=True) if p[0] == "derivative"]
-        figure.colorbar(shown, ax=derivative_axes, label=unit, shrink=0.85)
-    return save_figure(path, figure)
+        # in one row the bar stands beside the derivatives, below others it would not say whose it is
+        beside = axes if rows > 1 else [a for a, p in zip(axes, panels, strict=False) if p[0] == "derivative"]
+        figure.colorbar(shown, ax=beside, label=unit, shrink=0.85)
+    return figure
+
+
+def png_bytes(figure: Any) -> bytes:
+    """A Matplotlib figure as PNG, in memory."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
 
 
 def save_figure(path: str | os.PathLike, figure: Any) -> Path:

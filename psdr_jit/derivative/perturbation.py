@@ -41,6 +41,7 @@ class Perturbation:
     scale: float            # magnitude of the direction (motion) or else of the parameter
     centre: tuple[float, ...] = ()
     originals: dict[str, Any] = field(default_factory=dict)
+    how: dict[str, Any] = field(default_factory=dict)   # the arguments of `perturb` that it was made with
 
     @property
     def name(self) -> str:
@@ -106,7 +107,8 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     base = originals[name]
     position = name.rsplit(".", 1)[-1] == "position"
     movable = name.endswith(("vertex_positions", CONTROL_POINTS)) or info.shape == (4, 4) or position
-    common = dict(scene=scene, params=params, info=info, originals=originals)
+    asked = {"direction": _plain(direction), "rotate": _plain(rotate), "index": index}
+    common = dict(scene=scene, params=params, info=info, originals=originals, how=asked)
     if movable and index is None and (rotate is not None or not _is_full_direction(direction, base)):
         return _motion(common, base, direction, rotate)
     if rotate is not None:
@@ -114,6 +116,11 @@ def perturb(scene: Any, name: str, direction: Any = None, *, rotate: Sequence[fl
     if info.shape in ((4, 4), (3, 3)):
         raise ParameterError(f"'{name}' is a transform: give direction=(dx, dy, dz) or rotate=(ax, ay, az)")
     return _addition(common, base, direction, index)
+
+
+def _plain(direction: Any) -> Any:
+    """Numbers that any process understands."""
+    return _numbers(direction, "the direction") if dr.is_array_v(direction) else direction
 
 
 def _is_full_direction(direction: Any, base: Any) -> bool:

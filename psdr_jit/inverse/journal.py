@@ -1,15 +1,16 @@
 """What a run leaves on disk: a log, checkpoints, snapshots, pictures, and the final values.
 
-`log.jsonl` has one object per iteration; `checkpoint.npz` the state; `snapshots/` images; `result.png` a strip of the
-images before and after; `curves.png` loss and offsets; `final.npz` the values of all variables, meshes as PLY.
-All but the log are written beside and renamed. A full disk does not end a run: what could not be written is warned
-about, once each, and named in the result; the final values that are missing are named apart.
+`log.jsonl` has one object per iteration; `checkpoint.npz` the state; `snapshots/` images; `views/` the images before
+and after; `result.png` a strip of them; `curves.png` loss and offsets; `final.npz` the values of all variables, meshes
+as PLY. All but the log are written beside and renamed. A full disk does not end a run: what could not be written is
+warned about, once each, and named in the result; the final values that are missing are named apart.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,8 @@ from psdr_jit.scene.params import is_transform
 #: Views that the final strip shows, and samples per pixel of its images.
 SHOWN, STRIP_SPP = 3, 64
 
+VIEWS = "views"  # folder with the images of the strip, one per view
+
 SEED = 0x57121B  # of the strip's images
 
 
@@ -49,7 +52,7 @@ class Journal:
         try:
             (folder / "snapshots").mkdir(parents=True, exist_ok=True)
             images.check_writable(folder / "log.jsonl")
-            self._rows = [row for row in _rows(folder / "log.jsonl") if row["iteration"] < keep]
+            self._rows = [row for row in rows_of(folder / "log.jsonl") if row["iteration"] < keep]
             kept = "".join(json.dumps(row) + "\n" for row in self._rows).encode()
             files.write_bytes(folder / "log.jsonl", kept)  # a full disk must not cost the history
             self._log = open(folder / "log.jsonl", "a", encoding="utf-8")  # open as long as the run
@@ -119,6 +122,7 @@ class Journal:
             self.value(name, lambda name=name, content=content: files.write_bytes(self.folder / name, content))
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
+        self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows))
         self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
 
@@ -143,7 +147,7 @@ class Journal:
         return None
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def rows_of(path: Path) -> list[dict[str, Any]]:
     """Rows of a log; a last line that was cut off is dropped."""
     found = []
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
@@ -157,6 +161,13 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 def _look(problem: Any, view: Any) -> np.ndarray:
     with dr.suspend_grad():
         return np.array(problem.integrator.render(problem.scene, view.sensor, seed=SEED, spp=STRIP_SPP))
+
+
+def _write_views(folder: Path, rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, initial, final, target in rows:
+        layers = {"initial": initial, "final": final, "target": target}
+        images.write_exr(folder / (re.sub(r"[^\w.-]", "_", name) + ".exr"), layers)
 
 
 def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray]) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from psdr_jit.errors import CheckpointError, OptionError, StalledWarning, ZeroDerivativeWarning
+from psdr_jit.errors import CheckpointError, ClusterError, OptionError, StalledWarning, ZeroDerivativeWarning
 from psdr_jit.inverse import checkpoint as checkpoints
-from psdr_jit.inverse import lock
+from psdr_jit.inverse import lock, show
 from psdr_jit.inverse.checkpoint import Checkpoint
 from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
@@ -44,6 +44,13 @@ class Result:
     start_offsets: dict[str, dict[str, float]]  # ... and at the start
     not_written: list[str] = field(default_factory=list)  # what the disk did not take ...
     lost: dict[str, str] = field(default_factory=dict)  # ... and of that the final values, with the reason
+    folder: Path | None = None  # with log, pictures and values
+
+    def _repr_png_(self) -> bytes:
+        return show.result_png(self)
+
+    def _repr_html_(self) -> str:
+        return show.result_html(self)
 
 
 @dataclass
@@ -96,14 +103,16 @@ def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> 
         found = copied(state.history.best if status == DIVERGED else state.latents)
         problem.apply(found)
         start = problem.offsets(problem.start())
-        result = Result(
-            status, state.iteration, state.clock(), losses, state.history.mean, found, problem.offsets(found), start
-        )
+        result = Result(status, state.iteration, state.clock(), losses, state.history.mean, found,
+                        problem.offsets(found), start)  # fmt: skip
         if status != INTERRUPTED:
             journal.finish(problem, result)
+    except ClusterError:  # nothing has been stepped since
+        journal.keep(_checkpoint(problem, state))
+        raise
     finally:
         journal.close()
-    result.not_written, result.lost = journal.not_written, journal.lost
+    result.not_written, result.lost, result.folder = journal.not_written, journal.lost, folder
     return result
 
 
@@ -247,10 +256,8 @@ def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
     for name, variable in problem.variables.items():
         _step(problem, state, name, variable, rate)
     problem.apply(state.latents)
-    journal.step(
-        state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
-        problem.offsets(before),
-    )  # fmt: skip
+    journal.step(state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
+                 problem.offsets(before))  # fmt: skip
     every = problem.settings.snapshot_every
     if every and state.iteration % every == 0:
         journal.snapshot(state.iteration, problem, images)

@@ -9,10 +9,13 @@ from typing import Any
 
 import mitsuba as mi
 
+from psdr_jit.cluster.source import SceneFile
+from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse import loop
 from psdr_jit.inverse.problem import make_problem
+from psdr_jit.inverse.remote import with_crew
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.variables import Variable
 
@@ -27,7 +30,9 @@ def optimize(
     integrator: Any = None,
     out: str | os.PathLike | None = None,
     resume: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Callable[[int, int, str], None] | bool | None = None,
+    client: Any = None,
+    source: SceneFile | str | None = None,
     **settings: Any,
 ) -> loop.Result:
     """Change `variables` of `scene` until its sensors see `targets`; the scene is left at what was found.
@@ -43,7 +48,9 @@ def optimize(
     With a folder `out`: a log, checkpoints, snapshots, pictures, and the final values are written there, and
     `resume=True` goes on where an interrupted run of the same problem stopped, with the seeds and the moments that it
     would have had. Ctrl-C ends the iteration, writes a checkpoint and returns.
-    `progress(done, total, note)` is called after every iteration.
+    `progress(done, total, note)` is called after every iteration; True shows a bar, None does so in notebooks.
+    `client`: a `distributed.Client`, whose workers then render, view by view; `source`: the file that the scene was
+    loaded from. What a worker has begun is done by another one if it dies.
 
     Raises `ParameterError`, `OptionError`, `SceneError` or `UnsupportedError` before the first iteration. Warns
     (`StalledWarning`) where the loss does not depend on a variable, and of a loss that diverges; the run then ends and
@@ -54,4 +61,7 @@ def optimize(
     if unknown:
         raise OptionError(f"there is no setting {', '.join(map(repr, unknown))}; there are {', '.join(sorted(known))}")
     problem = make_problem(scene, variables, targets, loss, integrator, Settings(**settings))
-    return loop.run(problem, None if out is None else Path(out), resume, progress)
+    if client is not None:
+        problem = with_crew(problem, client, source, integrator)
+    with reporting("optimize", progress) as report:
+        return loop.run(problem, None if out is None else Path(out), resume, report)

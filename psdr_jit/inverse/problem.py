@@ -28,6 +28,7 @@ Latents = dict[str, dict[str, Any]]  # by parameter, by latent
 
 #: What a seed is for; the iteration, the view and this make it.
 TARGET_IMAGE, SECOND_IMAGE, GRADIENT = range(3)
+IMAGES = (TARGET_IMAGE, SECOND_IMAGE)
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Problem:
     own: Latents  # at the scene's own values
     fingerprint: str  # changes with whatever makes a stored state meaningless; targets apart
     target_means: np.ndarray  # by view: renders of one target may differ by rounding
+    crew: Any = None  # workers that evaluate it, see `remote`
 
     @property
     def period(self) -> int:
@@ -86,6 +88,8 @@ class Problem:
         latents: else the first view would use up the graph between them. A loss that is not finite, or whose
         derivative by the image is not, ends this with NaN and leaves the rest undone.
         """
+        if self.crew is not None:
+            return self.crew.evaluate(self, iteration)
         total, images = 0.0, {}
         chosen = self.chosen(iteration)
         with dr.isolate_grad():
@@ -103,15 +107,19 @@ class Problem:
 
     def _view(self, iteration: int, k: int) -> tuple[float, np.ndarray, mi.TensorXf]:
         """Loss of one view, its image, and the derivative of the loss by the image."""
-        view = self.views[k]
         images = []
         with dr.suspend_grad():
-            for purpose in (TARGET_IMAGE, SECOND_IMAGE)[: self.loss.images]:
-                image = self.integrator.render(self.scene, view.sensor, seed=self.seed(iteration, k, purpose),
+            for purpose in IMAGES[: self.loss.images]:
+                image = self.integrator.render(self.scene, self.views[k].sensor, seed=self.seed(iteration, k, purpose),
                                                spp=self.settings.spp)  # fmt: skip
                 images.append(mi.TensorXf(dr.detach(image)))
+        loss, grad = self.loss_of(k, images)
+        return loss, np.array(dr.detach(images[0])), grad
+
+    def loss_of(self, k: int, images: list[mi.TensorXf]) -> tuple[float, mi.TensorXf]:
+        """Loss of one view that looks like `images`, and its derivative by these, added up."""
         dr.enable_grad(images)
-        loss = self.loss.function(*images, view.target)
+        loss = self.loss.function(*images, self.views[k].target)
         if not dr.is_array_v(loss) or not dr.grad_enabled(loss):
             raise ParameterError(
                 f"the loss '{self.loss.name}' does not depend on the image: compute it with Dr.Jit functions "
@@ -125,7 +133,7 @@ class Problem:
         dr.backward(loss)
         grad = sum(dr.grad(image) for image in images)
         dr.eval(loss, grad)
-        return float(np.ravel(np.array(dr.detach(loss)))[0]), np.array(dr.detach(images[0])), grad
+        return float(np.ravel(np.array(dr.detach(loss)))[0]), grad
 
     def offsets(self, latents: Latents) -> dict[str, dict[str, float]]:
         """How far every variable is from the scene's own value."""

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ..core import markup
 from ..core.film_samples import FilmDensity
 from ..core.line_guide import LineGuide
 from ..errors import OptionError
@@ -92,6 +93,16 @@ class Plan:
         if plan.form not in FORMS:
             raise OptionError(f"a plan has the form {plan.form!r}: use {' or '.join(FORMS)}")
         return plan
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for t in self.terms:
+            numbers = (str(t.spp), str(t.segments)) if t.runs else ("–", "–")
+            why = t.reason if t.edges is None else f"{t.reason}; {t.edges}"
+            rows.append((t.name, "runs" if t.runs else "out", *numbers, why))
+        about = f"{self.form} form: {self.form_reason} · budgets {self.budget_reason}"
+        return markup.card("plan", about if self.light is None else f"{about} · light {self.light}",
+                           markup.table(("term", "", "spp", "segments/px", "why"), rows, text=(0, 1, 4)))
 
     def __str__(self) -> str:
         lines = [f"form     {self.form}: {self.form_reason}", f"budgets  {self.budget_reason}"]

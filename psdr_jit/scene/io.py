@@ -131,6 +131,12 @@ def _nodes(path: str | os.PathLike, defaults: dict[str, Any]) -> Any:
     return mi.parser.parse_file(config, os.fspath(path), **{k: str(v) for k, v in defaults.items()}).nodes
 
 
+def files_named(path: str | os.PathLike, **defaults: Any) -> list[str]:
+    """Names of the files that objects of a scene file are read from: meshes, textures, but not includes."""
+    found = [node.props["filename"] for node in _nodes(path, defaults) if "filename" in node.props.keys()]
+    return [str(name) for name in dict.fromkeys(found)]
+
+
 def _mesh_files(path: Path, defaults: dict[str, Any]) -> list[str]:
     """Names of the files that the scene's shapes are read from."""
     shapes = [n.props for n in _nodes(path, defaults) if n.type == mi.ObjectType.Shape]

@@ -11,8 +11,8 @@ from helpers import POWER, forward, load
 from problems import Problem, X
 
 from benchmarks.baselines import edge_sampling
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.derivative.statistics import gain
 from psdr_jit.errors import UnsupportedError
 from psdr_jit.sampling.rows import WeightedRows

@@ -19,8 +19,8 @@ from fuzz.build import build
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.derivative.statistics import Gain, block_means, block_test, gain
 from psdr_jit.errors import PsdrError, UnsupportedWarning
 

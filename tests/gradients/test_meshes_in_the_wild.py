@@ -9,9 +9,9 @@ from fuzz.meshes import box as cube
 from helpers import TERMS, assert_grad_close, fd, forward
 
 from benchmarks import meshes
-from psdr_jit.derivative.gradient import DerivativeSampler
 from psdr_jit.derivative.integrator_specs import build
 from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.derivative.statistics import gain
 
 STEP = 0.006  # of finite differences [scene units]: 0.03 px

@@ -207,4 +207,4 @@ def test_a_full_disk_does_not_end_a_run(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(images, "write_exr", failed)
     with pytest.warns(RuntimeWarning, match="the optimisation goes on"):
         result = loop.run(problem_of(iterations=3, checkpoint_every=1), tmp_path)
-    assert result.status == "finished" and set(result.not_written) == {"checkpoint.npz", "snapshots"}
+    assert result.status == "finished" and set(result.not_written) == {"checkpoint.npz", "snapshots", "views"}
