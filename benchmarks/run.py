@@ -20,6 +20,7 @@ from benchmarks import rows
 from benchmarks.suites import ON_REQUEST, REFERENCE, SUITES, suite
 from benchmarks.worker import DONE, START
 from psdr_jit.cli import common
+from psdr_jit.core import progress
 from psdr_jit.errors import PsdrError
 from psdr_jit.scene import io as scene_io
 
@@ -91,7 +92,7 @@ def done(folder: Path, names: tuple[str, ...]) -> set[Task]:
 def measure(pending: list[Task], args: argparse.Namespace) -> int:
     """One worker per case; the number of tasks that a worker did not survive."""
     lost, finished = 0, 0
-    with common.progress_bar("bench", quiet=False) as report:
+    with progress.bar("bench") as report:
         for name, case in dict.fromkeys((task.suite, task.case) for task in pending):
             left = [task.method for task in pending if (task.suite, task.case) == (name, case)]
             while left:

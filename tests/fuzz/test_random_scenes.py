@@ -7,11 +7,11 @@ import os
 import pprint
 
 import pytest
-from conftest import activate
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
 from fuzz.verdict import VARIANT, WRONG, Effort, Outcome, examine
+from variants import activate
 
 from psdr_jit.scene.params import find_param
 

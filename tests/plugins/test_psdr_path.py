@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import activate
 from helpers import adjoint_identity, load, motion_of, spec_of
 from problems import Problem, named
+from variants import activate
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, UnsupportedError, ZeroDerivativeWarning
