@@ -11,7 +11,6 @@ from variants import activate
 import psdr_jit  # noqa: F401  (registers the plugins)
 
 
-
 @pytest.fixture(autouse=True, scope="module")
 def no_scenes_left() -> Iterator[None]:
     """Dr.Jit's virtual calls reach every scene that is alive, also one that waits in a reference cycle."""
