@@ -166,7 +166,7 @@ def test_a_camera_passes(llvm, name):
     assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
 
 
-@pytest.mark.parametrize("normals", ["smooth", "analytic"])
+@pytest.mark.parametrize("normals", [pytest.param("smooth", marks=pytest.mark.slow), "analytic"])
 def test_coarse_grids_with_blended_normals_are_named(llvm, normals):
     scene = scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=8, normals=normals)
     motion = perturb(scene, "camera.to_world", (1, 0, 0))

@@ -116,7 +116,7 @@ def test_image_of(llvm, scene):
 
 
 @pytest.mark.parametrize("name", [
-    "spot_light", "glossy_floor", pytest.param("cbox", marks=SLOW), pytest.param("point_shadow", marks=SLOW)
+    "spot_light", pytest.param("glossy_floor", marks=SLOW), pytest.param("cbox", marks=SLOW), pytest.param("point_shadow", marks=SLOW)
 ])
 def test_without_caustics_nothing_changes(llvm, name):
     """The image and the derivative are those of the same kernels."""
@@ -131,7 +131,8 @@ def test_without_caustics_nothing_changes(llvm, name):
     assert np.allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(a).max())
 
 
-@pytest.mark.parametrize("light_paths", [pytest.param("auto", marks=SLOW), "only"])
+@pytest.mark.slow
+@pytest.mark.parametrize("light_paths", ["auto", "only"])
 def test_spot_moved(variant, light_paths):
     scene = load(GLASS, res=16)
     motion = perturb(scene, "lamp.to_world", X)
@@ -169,7 +170,7 @@ def test_same_flow_however_found(llvm, form):
 
 
 @pytest.mark.parametrize("param", [
-    "lamp.to_world", "ball.bsdf.eta", pytest.param("ball.to_world", marks=SLOW),
+    pytest.param("lamp.to_world", marks=SLOW), "ball.bsdf.eta", pytest.param("ball.to_world", marks=SLOW),
     pytest.param("camera.to_world", marks=SLOW),
 ])  # fmt: skip
 def test_forward_and_backward_are_transposes(variant, param):

@@ -101,6 +101,7 @@ def test_a_shadow_in_a_mirror(llvm, case):
     assert_grad_close(*images(case, "point", None, 2, 64))
 
 
+@pytest.mark.slow
 def test_a_pattern_and_a_shadow_in_a_mirror_that_turns(llvm):
     assert_grad_close(*images("mirror", "point", checkerboard(), 2, 32, 6), max_stderr=0.05)
 

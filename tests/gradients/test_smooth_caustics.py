@@ -115,10 +115,11 @@ def test_image_of_a_point(variant):
     assert abs(ours.mean() / exact.mean() - 1) < 0.01 and exact.mean() > 0.01
 
 
-@pytest.mark.parametrize("moved, factor", [(("lamp.to_world", X), -1), (("lamp.to_world", Y), 1),
-                                           (("mirror.to_world", X), 2), (("camera.to_world", X), None),
-                                           (("floor.to_world", Y), None)],
-                         ids=lambda value: value[0] if isinstance(value, tuple) else "")  # fmt: skip
+@pytest.mark.parametrize("moved, factor", [
+    (("lamp.to_world", X), -1), pytest.param(("lamp.to_world", Y), 1, marks=SLOW),
+    pytest.param(("mirror.to_world", X), 2, marks=SLOW), pytest.param(("camera.to_world", X), None, marks=SLOW),
+    pytest.param(("floor.to_world", Y), None, marks=SLOW),
+], ids=lambda value: value[0] if isinstance(value, tuple) else "")  # fmt: skip
 def test_a_plane_mirror(llvm, moved, factor):
     """What moves the light or the mirror moves the light behind it; no finite differences."""
     name, direction = moved
@@ -161,7 +162,8 @@ def test_same_flow_however_found(llvm, param):
 
 
 @pytest.mark.parametrize("light, param", [
-    ("spot", "lamp.to_world"), ("spot", "ball.bsdf.eta"), ("card", "ball.to_world"),
+    ("spot", "ball.bsdf.eta"),
+    pytest.param("spot", "lamp.to_world", marks=SLOW), pytest.param("card", "ball.to_world", marks=SLOW),
     pytest.param("spot", "camera.to_world", marks=SLOW), pytest.param("point", "ball.to_world", marks=SLOW),
 ])  # fmt: skip
 def test_forward_and_backward_are_transposes(variant, light, param):
