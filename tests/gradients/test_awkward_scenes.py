@@ -109,6 +109,7 @@ def test_a_light_with_several_sheets(llvm):
     assert_same(*found)
 
 
+@pytest.mark.slow
 def test_a_light_that_the_centre_of_a_ball_does_not_face(llvm):
     """The plane of the lamp passes above the centre; the top of the ball's contour is lit nevertheless."""
     turned = T().translate([2.5, 0, 0]).rotate([0, 1, 0], -90).scale(4)

@@ -99,6 +99,7 @@ def test_a_perspective_camera_in_the_plane_of_a_face(llvm, x, y):
     assert_alike(scene_of(camera), scene_of(camera, FURTHER * np.sign(x)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_face_that_is_barely_seen(llvm, smooth):
     """A ball one face of which turns to the viewer by 2e-5: lines of sight to its far side are as good as in its plane.

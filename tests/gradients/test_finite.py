@@ -42,6 +42,7 @@ def once(problems) -> list[Problem]:
     return list({(p.scene, p.param, str(p.load)): p for p in reversed(problems)}.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in once(PROBLEMS) if p.scene in QUICK])
 def test_quick(llvm, problem):
     check(problem, 2)

@@ -24,6 +24,7 @@ def compare(p: Problem, seeds: int, spp: int, max_stderr: float, **size) -> None
     assert_grad_close(material, spatial, max_stderr)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in PROBLEMS if p.scene in QUICK and not p.slow])
 def test_forms_agree(llvm, problem):
     compare(problem, seeds=12, spp=96, max_stderr=0.08, **SIZE)

@@ -96,6 +96,7 @@ def assert_right(scene: mi.Scene, param: str, how: dict, depth: int = 2, scale: 
     assert np.sqrt(np.mean(z**2)) < RMS_Z and np.abs(z).max() < MAX_Z, z.squeeze().round(1)
 
 
+@pytest.mark.slow
 def test_a_cube_shaded_as_if_it_were_round(llvm):
     assert_right(scene_of(coarse_cube(**REFLECTOR), **lamp()), *TURNED, scale=0.25)
 

@@ -122,6 +122,7 @@ def test_a_ramp_behind_a_tilted_plate(llvm):
     assert_grad_close(estimate, exact, max_stderr=0.01, reference_stderr=ROUNDING)
 
 
+@pytest.mark.slow
 def test_an_edge_behind_a_tilted_plate(llvm):
     """The outline of a card moves with η: nothing but the lines across the film sees it."""
     edge = -0.15  # near the middle of the film

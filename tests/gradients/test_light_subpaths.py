@@ -116,7 +116,8 @@ def test_image_of(llvm, scene):
 
 
 @pytest.mark.parametrize("name", [
-    "spot_light", pytest.param("glossy_floor", marks=SLOW), pytest.param("cbox", marks=SLOW), pytest.param("point_shadow", marks=SLOW)
+    "spot_light", pytest.param("glossy_floor", marks=SLOW), pytest.param("cbox", marks=SLOW),
+    pytest.param("point_shadow", marks=SLOW),
 ])
 def test_without_caustics_nothing_changes(llvm, name):
     """The image and the derivative are those of the same kernels."""
@@ -155,6 +156,7 @@ def test_derivative_by(llvm, param, how, options):
     assert_grad_close(estimate, fd(motion, {"type": "path", **LIMITS}, 0.006, 32, 4096), max_stderr=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["spatial", pytest.param("material", marks=SLOW)])
 def test_same_flow_however_found(llvm, form):
     """The interior term alone, where every vertex slides: what the light finds against what the camera finds.
@@ -181,6 +183,7 @@ def test_forward_and_backward_are_transposes(variant, param):
         assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
 
 
+@pytest.mark.slow
 def test_several_passes_are_transposes_too(llvm):
     integrator = integrator_specs.build(bdpt(record_mib=16, **QUICK))
     wJv, JTwv, w, Jv = adjoint_identity(load(GLASS, res=64), "lamp.to_world", integrator)
@@ -193,6 +196,7 @@ def test_later_calls_compile_nothing(llvm):
     assert compiled[0] > 0 and sum(compiled[3:]) == 0
 
 
+@pytest.mark.slow
 def test_nearly_smooth_glass_is_finite(llvm):
     scene = glass_scene(alpha=0.01)
     integrator = integrator_specs.build(bdpt(sppc=64, sppp=0, sppi=0))

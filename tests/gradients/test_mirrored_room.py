@@ -126,6 +126,7 @@ def test_what_surfaces_in_a_mirror_see_of_each_other(llvm, case):
     assert_grad_close(*images(case, "point", checkerboard(), 3, 2048))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sheet.to_world", pytest.param("lamp.position", marks=slow)])
 def test_backward_mode_is_the_adjoint(llvm, name):
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, "sppc": 0, "sppp": 0, "spps": 32})

@@ -82,6 +82,7 @@ def assert_gain(scene: mi.Scene, param: str, how: dict, seeds: int = 8, spp: int
     assert abs(slope.value - 1) < TOLERANCE + 2 * slope.stderr, slope
 
 
+@pytest.mark.slow
 def test_a_crop_window_sees_the_same_steps(llvm):
     """The camera is farther away than the film has pixels: depths must not be taken for places on the film."""
     scenes = (mi.load_dict(crop_scene(crop), optimize=False) for crop in ({}, CROP))

@@ -181,6 +181,7 @@ def test_a_box_filter_is_refused(llvm):
         integrator.render_forward(motion.scene, motion.params, spp=4)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_is_said(llvm):
     motion = perturb(glass_ball(), "lamp.to_world", X)
     motion.attach()

@@ -171,6 +171,7 @@ def test_no_kernel_is_compiled_after_the_first_iteration(llvm, name):
     assert new[0] > 0 and not any(new[1:]), new
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iterations", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_memory_is_flat(llvm, iterations):
     """Resident memory, looked at ten times; what the first tenth leaves behind does not count."""

@@ -125,6 +125,7 @@ def test_whatever_was_asked_for_belongs_to_the_problem(llvm, tmp_path):
         loop.run(problem_of([Pose(**variable)], iterations=2), tmp_path)
 
 
+@pytest.mark.slow
 def test_vertices_are_resumed(llvm, tmp_path):
     loop.run(problem_of([Vertices(BOX, 0.01, smoothness=2.0)], iterations=2), tmp_path)
     result = loop.run(problem_of([Vertices(BOX, 0.01, smoothness=2.0)], iterations=4), tmp_path, resume=True)

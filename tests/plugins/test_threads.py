@@ -25,6 +25,7 @@ def derivative(scene):
     return psdr_jit.gradient(scene, PARAMETER, (1, 0, 0), spp=4, seeds=4, integrator=INTEGRATOR).total
 
 
+@pytest.mark.slow
 def test_two_threads_that_differentiate_wait_for_each_other(llvm):
     scenes, found, errors = [load(), load()], {}, []
     expected = derivative(scenes[0])
