@@ -47,25 +47,31 @@ class ChainWorld:
     depth: int  # largest number of segments
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
     patterns: ChainPatterns | None  # None: no surface steps inside
-    moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape; [0]: because the camera does
-    lights: mi.Bool  # may steps move because lights do?
+    moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape
+    camera: mi.Bool  # may they because the camera does, ...
+    lights: mi.Bool  # ... or because lights do?
 
     @staticmethod
     def of(job: Job) -> ChainWorld:
         facts = job.facts
         flat = {s.index for s in facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         changing = {s.index for s in facts.shapes if s.geometry or s.shading or s.material}
-        moving = registry_table(job.scene, changing)
-        dr.scatter(moving, varying(mi.UInt32, int(facts.camera_moves)), mi.UInt32(0))
         lights = facts.emitters_move or any(s.is_emitter and s.index in changing for s in facts.shapes)
         depth = min(job.limits.max_depth, CHAIN_DEPTH)
-        return ChainWorld(job.scene, depth, registry_table(job.scene, flat), ChainPatterns.of(job), moving,
-                          varying(mi.Bool, lights))  # fmt: skip
+        return ChainWorld(
+            scene=job.scene,
+            depth=depth,
+            flat=registry_table(job.scene, flat),
+            patterns=ChainPatterns.of(job),
+            moving=registry_table(job.scene, changing),
+            camera=varying(mi.Bool, facts.camera_moves),
+            lights=varying(mi.Bool, lights),
+        )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
-        """May a step move because of one of `shapes`, or of the camera? As pointers or by registry index."""
+        """May a step move because of one of `shapes`? As pointers or by registry index."""
         found = mi.UInt32(0)
-        for shape in (mi.UInt32(0), *shapes):
+        for shape in shapes:
             index = shape if isinstance(shape, mi.UInt32) else dr.reinterpret_array(mi.UInt32, shape)
             found |= dr.gather(mi.UInt32, self.moving, index)
         return found != 0
@@ -224,6 +230,7 @@ def trace_pair(
         pair.β_a *= dr.select(active, on_a.factor, 1)
         pair.β_b *= dr.select(active, on_b.factor, 1)
         ray_a, ray_b = on_a.ray, on_b.ray
+    pair.moves |= world.camera
     return pair
 
 

@@ -78,8 +78,9 @@ class _Question:
     def job(self, plan: Plan, spp: int, term: TermPlan | None = None) -> Job:
         """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes."""
         tubes = tubes_of_call(self.call, self.facts, self.shared)
-        return Job(self.call, self.facts, plan, SceneMotion(self.call.sensor, tubes), self.shared, spp,
-                   *((term.film, term.lines) if term is not None else ()))  # fmt: skip
+        film, lines = (None, None) if term is None else (term.film, term.lines)
+        motion = SceneMotion(self.call.sensor, tubes)
+        return Job(self.call, self.facts, plan, motion, self.shared, spp, film, lines)
 
 
 def prepare(call: Call) -> Prepared:

@@ -242,7 +242,7 @@ def forward(found: LightBorne) -> mi.TensorXf:
     rate, p_grad = _forward_sweep(found, *first)
     rejected = found.job.call.counters.rejected
     V_grad = rejected.keep_finite(found.value * rate)
-    p_grad = dr.select(dr.all(dr.isfinite(p_grad)), p_grad, 0)
+    p_grad = rejected.keep_finite(p_grad)
     with dr.resume_grad():
         p, value = mi.Point2f(found.path.p), mi.Spectrum(found.value)
         dr.enable_grad(p, value)
