@@ -89,10 +89,11 @@ FINE = ("on a floor: move x", "on a floor: turn y", "under a box: move x", "on a
         "tiles: move z", "flush in front: move x", "above a floor: move y", "sunk into a floor: move y")  # fmt: skip
 
 
-def edges_of(scene: mi.Scene, param: str, how: dict):
+def edges_of(scene: mi.Scene, param: str, how: dict, **options):
     motion = perturb(scene, param, **how)
     motion.attach()
-    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "form": "spatial", "sppc": 1})
+    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", "sppc": 1, **options}
+    integrator = integrator_specs.build(spec)
     table = scene_edges(prepare(integrator.call(scene, scene.sensors()[0], 0, 1)).jobs[0][1])
     motion.restore()
     return table
@@ -118,6 +119,20 @@ def test_flush_shapes_that_are_parted_are_named(llvm):
         texts = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
         assert len(texts) == (case in PARTED), case
         assert all("flush contact" in text and "'moved'" in text and "'still'" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("height", "form", "depth", "said"),
+    [(0.2, "material", 3, True), (0.1, "material", 3, True), (0.1, "spatial", 3, False), (0.1, "material", 2, False),
+     (0.4, "material", 3, False)],
+)  # fmt: skip
+def test_material_form_at_contacts_is_named(llvm, height, form, depth, said):
+    """A box in, on and above a floor that it slides along: of the total 10 % is missing where they touch."""
+    scene = scene_of({"still": cube((0, -0.3, 0), (0.3,) * 3), "moved": cube((0, height, 0), (0.2,) * 3)})
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        edges_of(scene, "moved.vertex_positions", {"direction": AXES["x"]}, form=form, max_depth=depth)
+    assert any("material form" in str(w.message) for w in found) == said
 
 
 def test_common_parts_are_counted_once(llvm):
