@@ -51,7 +51,8 @@ def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> No
     """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
 
     For meshes that shine or mirror: of what they send, as much as sinks below the plane of one of their faces is lost
-    in a step, which neither an edge nor a horizon stands for.
+    in a step, which neither an edge nor a horizon stands for. And for two-sided ones: what sinks below a face gets
+    inside, and out again, by way of edges that are only there for who is inside.
     """
     unknown = [mesh for mesh in meshes if mesh.id() not in memory[LOOKED_AT]]
     if dr.flag(dr.JitFlag.FreezingScope):
@@ -64,8 +65,8 @@ def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> No
             warn_once(
                 f"mesh '{mesh.id()}' is shaded with normals that are more than {limit:g} degrees off its "
                 "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
-                "reflects is missing from the derivative; split its normals at sharp edges, set face_normals, or use "
-                "a finer mesh",
+                "reflects is missing from the derivative, and so is what gets in and out between its faces; split its "
+                "normals at sharp edges, set face_normals, or use a finer mesh",
                 UnsupportedWarning,
                 memory,
             )

@@ -215,9 +215,14 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.
         flips = job.facts.has_delta_emitters and job.options.depth_limit > 2
         missing = [shape for shape, s in zip(shapes, meshes, strict=True)
-                   if s.smooth and (s.is_emitter or s.delta_lobes or flips)]  # fmt: skip
+                   if s.smooth and (s.is_emitter or s.delta_lobes or flips or _lets_light_in(job, shape))]  # fmt: skip
         warn_about_coarse(missing, limit, job.call.memory)
     return [ShadingOutlines(faces, centre)]
+
+
+def _lets_light_in(job: Job, mesh: mi.Mesh) -> bool:
+    """Do paths go on inside? What is scattered below a face's plane gets in, and back out after another vertex."""
+    return job.options.depth_limit > 3 and mi.has_flag(mesh.bsdf().flags(), mi.BSDFFlags.BackSide)
 
 
 def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:

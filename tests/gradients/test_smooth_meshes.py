@@ -168,14 +168,15 @@ def coarse_cube(**children: dict) -> mi.Mesh:
 
 
 MIRROR = {"bsdf": {"type": "conductor"}}
+TWO_SIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
 
 
 @pytest.mark.parametrize("mesh, children, named", [
     (coarse_cube, LIGHT, True), (coarse_cube, MIRROR, True), (coarse_cube, REFLECTOR, False),
-    (lambda **children: sphere(16, **children), MIRROR, False),
-], ids=["light", "mirror", "reflector", "fine"])  # fmt: skip
+    (coarse_cube, TWO_SIDED, True), (lambda **children: sphere(16, **children), MIRROR, False),
+], ids=["light", "mirror", "reflector", "two sides", "fine"])  # fmt: skip
 def test_normals_far_off_their_faces_are_named(llvm, mesh, children, named):
-    """Where a face's plane cuts what it mirrors is neither an edge nor a horizon."""
+    """Where a face's plane cuts what it mirrors is neither an edge nor a horizon, nor is what gets inside."""
     lamp = {"type": "rectangle", "emitter": {"type": "area"}}
     mesh = mesh(**children)
     mesh.set_id("shape")
