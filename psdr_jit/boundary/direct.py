@@ -31,7 +31,9 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.kind import Use
+from ..edges.kind_junction import Junctions
 from ..edges.location import EdgeLocation
+from ..edges.points import LEAST_SLANT, start_height
 from ..options import Options
 from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
@@ -58,6 +60,9 @@ NAME = "direct"
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
 #: are drawn as make about one path per sample.
 LINES_PER_PATH_UNDER_SKY = 2
+
+#: Share of the height at which rays start that is left out above a surface which one looks for from there.
+INSIDE = 0.02
 
 
 @dataclass
@@ -129,6 +134,8 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     r = pd.t - on.lead
     # A contour's own surface may begin within its lead.
     active &= pd.is_valid() & (r > dr.select(on.aside > 0, on.offset, on.lead))
+    if any(isinstance(kind, Junctions) for kind in edges.table.kinds):
+        active &= ~thinner_than_lift(scene, pd, down, active)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     segment = BoundarySegment(
@@ -147,6 +154,20 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
         drawn=line.drawn,
     )
     return compact(segment, active)
+
+
+def thinner_than_lift(scene: mi.Scene, hit, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Is the shadow that ends at `hit` too thin to be in the image, next to where two surfaces meet?
+
+    Mitsuba starts rays a height h above surfaces. The line is met at that height by the ray of another receiver, whose
+    place may lie beyond the curve where the surfaces meet: no receiver has this shadow then.
+    """
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+    facing = dr.dot(si.n, ray.d)
+    n = dr.select(facing > 0, -si.n, si.n)
+    height = start_height(si.p)
+    on_line = si.p - ray.d * height / dr.maximum(dr.abs(facing), LEAST_SLANT)
+    return scene.ray_test(mi.Ray3f(on_line, -n, (1 - INSIDE) * height, 0, ray.wavelengths), active)
 
 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:

@@ -50,9 +50,14 @@ def clearance(x: mi.Point3f, size: mi.Float, centre: mi.Point3f, blur: mi.Float 
     return visible + rounding, LEAD * visible + ROUNDING_LEAD * rounding
 
 
+def start_height(x: mi.Point3f) -> mi.Float:
+    """The height above a surface at `x` at which Mitsuba starts rays [m]."""
+    return MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
+
+
 def clear_of_lift(x: mi.Point3f) -> mi.Float:
-    """A height above a surface at `x` that is more than that at which Mitsuba starts rays [m]."""
-    return CLEAR_OF_LIFT * MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
+    """A height above a surface at `x` that is more than that [m]."""
+    return CLEAR_OF_LIFT * start_height(x)
 
 
 def face_inset(p0: mi.Point3f, p1: mi.Point3f, apex: mi.Point3f, n0: mi.Normal3f, n1: mi.Normal3f) -> mi.Float:

@@ -18,6 +18,7 @@ from psdr_jit.scene.params import find_param
 FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
+FOUND = (461,)  # seeds that were wrong once: a shadow on a mesh, thinner than the height at which rays start
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
@@ -37,6 +38,13 @@ def test_a_random_scene(mono, seed):
         return
     smallest = shrunk(case, lambda smaller: _same(smaller, outcome), SHRINK_SECONDS)
     pytest.fail(f"seed {seed}: {outcome.word}, {outcome.text}\n{pprint.pformat(smallest, width=120)}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", FOUND)
+def test_a_scene_that_was_wrong(mono, seed):
+    outcome = examine(case_of(seed))
+    assert not outcome.failed, outcome.text
 
 
 def _same(case: Case, outcome: Outcome) -> bool:
