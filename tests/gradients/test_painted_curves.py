@@ -19,7 +19,7 @@ SPLINE = ((-1.9, -0.6, -0.3, 0.34), (-0.9, 0.1, 0.4, 0.32), (0.1, -0.3, -0.3, 0.
           (1.6, -0.7, -0.2, 0.32))  # fmt: skip
 RODS = ((-1.2, -0.3, 0.3, 0.3), (-0.4, 0.2, -0.5, 0.26), (0.4, -0.2, 0.4, 0.38), (1.2, 0.1, -0.3, 0.25))
 CURVES = {"bsplinecurve": SPLINE, "linearcurve": RODS}
-SHINY = {"type": "roughconductor", "alpha": 0.2, "material": "Ag"}
+SHINY = {"type": "roughconductor", "alpha": 0.3, "material": "Ag"}
 
 #: Enough for what is said before a ray is traced.
 ONE_TERM = {"type": "psdr_path", "sppc": 1, "max_depth": 4}
@@ -55,7 +55,7 @@ def assert_gain(scene: mi.Scene, param: str, depth: int = 2, step: float = 0.003
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnsupportedWarning)
         estimate = forward(motion, spec, 16, spp)
-    assert_grad_close(estimate, fd(motion, spec, step, 128, 512), max_stderr)
+    assert_grad_close(estimate, fd(motion, spec, step, 128, spp), max_stderr)
 
 
 @pytest.mark.slow
@@ -78,9 +78,9 @@ def test_it_turns_with_a_single_control_point(llvm, tmp_path, plugin):
 @pytest.mark.slow
 @pytest.mark.parametrize("plugin", CURVES)
 def test_it_is_seen_in_a_shiny_floor(llvm, tmp_path, plugin):
-    """The film shows the floor alone."""
+    """The film shows the floor alone; finite differences are noisy."""
     scene = scene_of(tmp_path, plugin, checkered(), target=(0.1, -1.6, -1.4), fov=14, floor=SHINY)
-    assert_gain(scene, "tube.control_points", 3, direction=(1, 0, 0))
+    assert_gain(scene, "tube.control_points", 3, 0.015, 0.05, 2048, direction=(1, 0, 0))
 
 
 @pytest.mark.parametrize("plugin", CURVES)
