@@ -166,6 +166,10 @@ PROBLEMS = (
     Problem("patterns", "floor.to_world", 0.004, direction=X, slow=True),
     Problem("patterns", "ball.to_world", 0.004, rotate=(1, 1, 0), slow=True),
     Problem("patterns", "camera.to_world", 0.0005, rotate=Y, slow=True),
+    Problem("painted_curves", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
+    Problem("painted_curves", "spline.control_points", 0.004, direction=(1, 1, 0), load=GAUSSIAN, slow=True),
+    Problem("painted_curves", "rods.control_points", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
+    Problem("painted_curves", "rods.control_points", 0.004, index=5, load=GAUSSIAN, tag="bent", slow=True),
     # shapes that cut into each other
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=Y),
     Problem("sunk_box", "box.vertex_positions", 0.003, direction=X, slow=True),

@@ -19,10 +19,13 @@ from ..core.upload import uploaded
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
+from ..scene.curve_ends import SEGMENTS
 from ..scene.facts import ShapeFacts
 from ..scene.patterns import StepFamily, pattern_textures, step_families, steps_between_faces, texture_values
+from .curve_pattern_rows import curve_patterns
 from .edge_shapes import edge_shapes
 from .kind import EdgeKind
+from .kind_curve_pattern import RodPatterns, TubePatterns
 from .kind_pattern import AnalyticPatterns, MeshPatterns
 from .overlaps import apart
 from .pattern_rows import MOST_LINES, PatternSet, pattern_set, too_fine
@@ -35,7 +38,7 @@ class _Known:
     """The patterns of a shape, and what they were made from, kept alive so that it can be told from something else."""
 
     values: list  # textures and their parameters
-    buffers: list  # texture coordinates and faces of a mesh
+    buffers: list  # texture coordinates and faces of a mesh, segments of a curve
     families: list[StepFamily]
     between_faces: bool
     patterns: ShapePatterns
@@ -46,15 +49,17 @@ class _Table:
     """Patterns of several shapes in one table."""
 
     found: list[ShapePatterns | None]
-    offsets: list[int]  # of their vertices
+    offsets: list[int]  # of their vertices, or segments
     lines: PatternSet | None
 
 
 #: Of an integrator: patterns by name of the shape.
 PATTERNS: Slot[dict[str, _Known]] = Slot(dict)
 
-#: Of an integrator: the tables last made, of meshes (True) and of other shapes.
-TABLES: Slot[dict[bool, _Table]] = Slot(dict)
+#: Of an integrator: the tables last made, by family of shapes.
+TABLES: Slot[dict[str, _Table]] = Slot(dict)
+
+MESH, ANALYTIC = "mesh", "analytic"
 
 
 def patterns_of(job: Job, chosen: list[ShapeFacts]) -> list[ShapePatterns | None]:
@@ -73,18 +78,18 @@ def pattern_kinds(
 ) -> tuple[EdgeKind, ...]:
     """The patterns of all shapes as kinds of edges; none where there are no lines."""
     kinds: list[EdgeKind] = []
-    for chosen, are_meshes in ((meshes, True), (analytic, False)):
+    for chosen, family in ((meshes, MESH), (analytic, ANALYTIC)):
         if not any(facts.patterns for facts in chosen):
             continue
         shapes, found = [edge_shapes(job).shapes[facts.index] for facts in chosen], patterns_of(job, chosen)
-        lines = _lines(job.call.memory, found, shapes, are_meshes)
+        lines = _lines(job.call.memory, found, [s.vertex_count() if s.is_mesh() else 0 for s in shapes], family)
         if lines is None:
             continue
-        moves = dr.gather(mi.Bool, uploaded(mi.Bool, np.array([facts.moves for facts in chosen])), lines.rows.shape)
+        moves = _moves(chosen, lines)
         front, back = _seen_sides(job, chosen, found, lines)
         pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
         common = (pointers, centre, tuple(shapes))
-        if are_meshes:
+        if family == MESH:
             positions = dr.detach(attached_positions(tuple(shapes)))
             dr.eval(moves, front, back, positions)
             kinds.append(MeshPatterns(lines, moves, front, back, *common, positions))
@@ -92,20 +97,50 @@ def pattern_kinds(
             closed, either = back == 0, dr.full(mi.Float, 1, dr.width(moves))
             dr.eval(moves, closed)
             kinds.append(AnalyticPatterns(lines, moves, either, either, *common, closed))
-    return tuple(kinds)
+    return (*kinds, *_on_curves(job, centre))
+
+
+def _on_curves(job: Job, centre: mi.Point3f) -> list[EdgeKind]:
+    """The patterns of B-spline and linear curves."""
+    kinds: list[EdgeKind] = []
+    if job.tubes is None:
+        return kinds
+    for segments, plugin, kind in (
+        (job.tubes.splines, "bsplinecurve", TubePatterns), (job.tubes.rods, "linearcurve", RodPatterns)
+    ):  # fmt: skip
+        chosen = [facts for facts in edge_shapes(job).facts if facts.kind == "curve" and facts.plugin == plugin]
+        if segments is None or not any(facts.patterns for facts in chosen):
+            continue
+        counts = [shape.primitive_count() for shape in segments.shapes]
+        lines = _lines(job.call.memory, patterns_of(job, chosen), counts, plugin)
+        if lines is not None:
+            moves = _moves(chosen, lines)
+            either = dr.full(mi.Float, 1, dr.width(moves))
+            dr.eval(moves)
+            kinds.append(kind(lines, moves, either, either, segments.pointers, centre, segments.shapes, segments))
+    return kinds
+
+
+def _moves(chosen: list[ShapeFacts], lines: PatternSet) -> mi.Bool:
+    """By row: can its shape move?"""
+    return dr.gather(mi.Bool, uploaded(mi.Bool, np.array([facts.moves for facts in chosen])), lines.rows.shape)
 
 
 def _shape_patterns(job: Job, facts: ShapeFacts) -> _Known:
     shape, known = edge_shapes(job).shapes[facts.index], job.call.memory[PATTERNS].get(facts.name)
     if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
         return known
-    textures = pattern_textures(shape)
+    is_curve = facts.kind == "curve"
+    textures = pattern_textures(shape, is_curve)
     values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]
     buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
+    buffers += [mi.traverse(shape)[SEGMENTS]] if is_curve else []
     if known is None or not _unchanged(known, values, buffers):
         families, between_faces = _families(textures, shape, facts, job.call.memory), steps_between_faces(textures)
         if facts.is_mesh:
             patterns = mesh_patterns(shape, families, between_faces)
+        elif is_curve:
+            patterns = curve_patterns(shape, facts.plugin, families)
         else:
             patterns = analytic_patterns(facts.plugin, families)
         known = _Known(values, buffers, families, between_faces, patterns)
@@ -149,13 +184,10 @@ def _families(textures: list[mi.Texture], shape: mi.Shape, facts: ShapeFacts, me
     return kept
 
 
-def _lines(
-    memory: Memory, found: list[ShapePatterns | None], shapes: list[mi.Shape], are_meshes: bool
-) -> PatternSet | None:
-    """The lines of several shapes in one table, kept while they are the same."""
-    counts = [shape.vertex_count() if are_meshes else 0 for shape in shapes]
-    offsets = [sum(counts[:k]) for k in range(len(shapes))]
-    known = memory[TABLES].get(are_meshes)
+def _lines(memory: Memory, found: list[ShapePatterns | None], counts: list[int], family: str) -> PatternSet | None:
+    """The lines of several shapes, of `counts` vertices or segments, in one table, kept while they are the same."""
+    offsets = [sum(counts[:k]) for k in range(len(counts))]
+    known = memory[TABLES].get(family)
     if known is None or known.offsets != offsets or any(a is not b for a, b in zip(known.found, found, strict=True)):
         parts = []
         for k, patterns in enumerate(found):
@@ -165,7 +197,7 @@ def _lines(
         known = _Table(found, offsets, pattern_set(parts))
         if known.lines is not None:
             dr.eval(known.lines.rows, known.lines.s, known.lines.inset)
-        memory[TABLES][are_meshes] = known
+        memory[TABLES][family] = known
     return known.lines
 
 

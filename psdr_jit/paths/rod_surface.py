@@ -10,7 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.rod import Rod
+from ..core.curve_frame import turns
 from ..scene.tubes import Rods
 from .own_surface import of_hit, on_ray, where_active
 
@@ -41,15 +41,5 @@ def rod_surface(
     v, n = rod.place(p)
     si.p, si.n, si.sh_frame = p, mi.Normal3f(n), mi.Frame3f(n)
     count = dr.gather(mi.UInt32, rods.count, dr.reinterpret_array(mi.UInt32, pi.shape), active)
-    si.uv = mi.Point2f(_turns(rod, n), (v + pi.prim_index) / count)
+    si.uv = mi.Point2f(turns(rod.axis[0], n), (v + pi.prim_index) / count)
     return of_hit(si, pi, ray, (o, d, t))
-
-
-def _turns(rod: Rod, n: mi.Vector3f) -> mi.Float:
-    """Texture coordinate u of Mitsuba: turns about the axis, from the direction nearest to the z axis."""
-    axis, _ = rod.axis
-    up = mi.Vector3f(0, 0, 1) - axis * axis.z
-    upright = dr.squared_norm(up) > 0
-    up = dr.select(upright, dr.normalize(dr.select(upright, up, mi.Vector3f(0, 1, 0))), mi.Vector3f(0, 1, 0))
-    u = dr.atan2(dr.dot(up, n), dr.dot(dr.cross(up, axis), n)) * dr.inv_two_pi
-    return dr.select(u < 0, u + 1, u)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.curve_frame import turns
 from ..core.tube_axis import Axis
 from ..scene.tubes import Splines, Tubes
 from .ellipsoid_surface import ellipsoid_surface
@@ -86,10 +87,7 @@ def _material(axis: Axis, x: mi.Point3f) -> mi.Vector3f:
 
 
 def _geometry(axis: Axis, p: mi.Point3f) -> mi.SurfaceInteraction3f:
-    """Normal, frame, tangents by (u, segment) and u at a point `p` of the circle of `axis`, all attached to both.
-
-    u is measured as Mitsuba does, from the direction nearest to the z axis.
-    """
+    """Normal, frame, tangents by (u, segment) and u at a point `p` of the circle of `axis`, all attached to both."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     ρ = p - axis.c
     a, b, _ = axis.circle(ρ)
@@ -99,8 +97,5 @@ def _geometry(axis: Axis, p: mi.Point3f) -> mi.SurfaceInteraction3f:
     along = dr.select(axis.bend(ρ) > 0, axis.bend(ρ), 0) / dr.squared_norm(axis.dc)
     si.dp_du = dr.two_pi * axis.r * b
     si.dp_dv = along * axis.dc + axis.dr * a
-    up, _, _ = axis.circle(mi.Vector3f(0, 0, 1))
-    across = dr.cross(up, dr.normalize(axis.dc))
-    u = dr.atan2(dr.dot(up, a), dr.dot(across, a)) * dr.inv_two_pi
-    si.uv = mi.Point2f(dr.select(u < 0, u + 1, u), 0)
+    si.uv = mi.Point2f(turns(dr.normalize(axis.dc), a), 0)
     return si

@@ -21,7 +21,8 @@ def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[
     """The forms that come into question, the safer one first, and the reason if there is one only."""
     if facts.geometry_moves and facts.has_delta_lobes:
         return ("spatial",), "directions follow mirrors and glass"
-    unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL]
+    # points of a B-spline are followed, but not as its texture coordinates turn about its axis
+    unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL or (s.kind == "curve" and s.patterns)]
     if facts.geometry_moves and unmapped:
         return ("spatial",), f"the points of '{unmapped[0]}' are not followed"
     if options.form != "auto":

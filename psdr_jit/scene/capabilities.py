@@ -73,6 +73,9 @@ JUMPING_PLUGINS = frozenset({"checkerboard", "bumpmap"})
 PATTERN_PLUGINS = frozenset({"checkerboard", "bitmap", "bumpmap", "mesh_attribute"})
 """What has steps on surfaces that are edges of their own, if it has any."""
 
+PATTERNS_ON_CURVES = frozenset({"checkerboard", "bitmap"})
+"""The same, on B-spline and linear curves."""
+
 FRAME_FREE_PLUGINS = frozenset({
     "diffuse", "dielectric", "thindielectric", "conductor", "plastic", "pplastic", "null", "roughconductor",
     "roughdielectric", "roughplastic", "principled", "principledthin", "mask", "twosided", "blendbsdf",

@@ -234,8 +234,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
-    # of the steps on a curve, none are edges; a grid has one texture coordinate all over
-    missing, jumps = (steps, jumps) if kind == "curve" else (missing_patterns(steps), missing_patterns(jumps))
+    missing, jumps = (missing_patterns(found, on_curve=kind == "curve") for found in (steps, jumps))
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .capabilities import PATTERN_PLUGINS
+from .capabilities import PATTERN_PLUGINS, PATTERNS_ON_CURVES
 from .graph import child_objects, is_piecewise_constant, plugin_name
 
 #: Texels of a bitmap that are looked at outside of its unit square, to see how it goes on there.
@@ -40,9 +40,13 @@ class StepFamily:
         return k[self.steps[k.astype(np.int64) % len(self.steps)]]
 
 
-def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
+def missing_patterns(jumps: tuple[str, ...], on_curve: bool = False) -> tuple[str, ...]:
     """Those of `graph.jumping_textures` whose steps are no edges."""
-    return tuple(jump for jump in jumps if jump.split(" ")[0] not in PATTERN_PLUGINS)
+    return tuple(jump for jump in jumps if jump.split(" ")[0] not in _plugins(on_curve))
+
+
+def _plugins(on_curve: bool) -> frozenset[str]:
+    return PATTERNS_ON_CURVES if on_curve else PATTERN_PLUGINS
 
 
 def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str, ...]) -> tuple[str, ...]:
@@ -57,9 +61,10 @@ def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str,
     return (*own, *(jump for jump in jumps if jump not in missing))
 
 
-def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
+def pattern_textures(shape: mi.Shape, on_curve: bool = False) -> list[mi.Object]:
     """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
-    return stepping_textures([shape.bsdf(), shape.emitter()])
+    found = stepping_textures([shape.bsdf(), shape.emitter()])
+    return [node for node in found if plugin_name(node) in _plugins(on_curve)]
 
 
 def stepping_textures(owners: list[mi.Object | None]) -> list[mi.Object]:

@@ -19,6 +19,8 @@ CASES = {  # what moves: (scene, parameter, terms whose derivative is not zero)
     "cylinder": ("cylinder_outline", "tube.to_world", {"primary"}),
     "curve": ("curve_shadow", "blocker.control_points", {"interior", "primary", "direct"}),
     "linear-curve": ("rod_shadow", "blocker.control_points", {"interior", "primary", "direct"}),
+    "painted-spline": ("painted_curves", "spline.control_points", {"interior", "primary", "direct"}),
+    "painted-rods": ("painted_curves", "rods.control_points", {"interior", "primary", "direct"}),
     "ellipsoids": ("ellipsoids_shadow", "blocker.data", {"interior", "primary", "direct"}),
     "grid": ("grid_shadow", "blocker.grid", {"interior", "primary", "direct"}),
     "camera-pose": ("lit_box", "camera.to_world", {"interior", "primary"}),
@@ -53,7 +55,8 @@ def check(case: str, term: str | None, known: bool | None, **options) -> None:
 
 # much as others, with kernels of their own to compile
 SLOW = (
-    "orthographic", "thin-lens", "sunk-ball", "sunk-mesh", "floor-around-ball", "sky", "curve", "ellipsoids", "grid"
+    "orthographic", "thin-lens", "sunk-ball", "sunk-mesh", "floor-around-ball", "sky", "curve", "painted-spline",
+    "painted-rods", "ellipsoids", "grid",
 )  # fmt: skip
 
 

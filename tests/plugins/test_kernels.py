@@ -29,6 +29,7 @@ def test_later_calls_compile_nothing(llvm, mode, form):
     ("name", "param"),
     [
         ("rod_shadow", "blocker.control_points"),
+        ("painted_curves", "spline.control_points"),
         ("grid_shadow", "blocker.grid"),
         ("grid_shadow", "camera.to_world"),
         ("ellipsoids_shadow", "camera.to_world"),

@@ -13,6 +13,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_curve_pattern import RodPatterns, TubePatterns
 from psdr_jit.edges.kind_ellipsoid import EllipsoidOutlines
 from psdr_jit.edges.kind_grid import GridEdges
 from psdr_jit.edges.kind_junction import Junctions
@@ -36,6 +37,8 @@ PLACES = {  # kind: a scene that has it, and what moves there
     ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
+    TubePatterns: ("painted_curves", ["spline.control_points"]),
+    RodPatterns: ("painted_curves", ["rods.control_points"]),
     TubeOutlines: ("curve_shadow", ["blocker.control_points"]),
     RodEdges: ("rod_shadow", ["blocker.control_points"]),
     EllipsoidOutlines: ("ellipsoids_shadow", ["blocker.data"]),
