@@ -1,8 +1,9 @@
 """Recover parameters of a scene from images, as a TOML file says.
 
-Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
-checkpoint (a second one stops at once, without); --resume goes on from it with the same seeds and moments. Exit status:
-0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not be saved, 130 interrupted.
+Log, checkpoints, snapshots, pictures and the scene that was found, final.xml, go to a folder (see --out). Ctrl-C ends
+the current iteration and writes a checkpoint (a second one stops at once, without); --resume goes on from it with the
+same seeds and moments. Exit status: 0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not
+be saved, 130 interrupted.
 """
 
 from __future__ import annotations

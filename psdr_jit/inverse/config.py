@@ -34,6 +34,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from psdr_jit.cluster.source import SceneFile
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse.losses import LOSSES
@@ -215,7 +216,8 @@ def problem_of(config: Config) -> Problem:
             if sensor in targets:
                 raise OptionError(f"'{config.path}': sensor {sensor} has two targets")
             targets[sensor] = target["file"] if "file" in target else rendered(source, sensor, path, target["render"])
-    return make_problem(scene, config.variables, targets, config.loss, integrator, config.settings)
+    problem = make_problem(scene, config.variables, targets, config.loss, integrator, config.settings)
+    return replace(problem, source=SceneFile(str(config.scene), dict(config.defaults)))
 
 
 def with_integrator(config: Config, plugin: str) -> Config:

@@ -2,8 +2,9 @@
 
 `log.jsonl` has one object per iteration; `checkpoint.npz` the state; `snapshots/` images; `views/` the images before
 and after; `result.png` a strip of them; `curves.png` loss and offsets; `final.npz` the values of all variables, meshes
-as PLY. All but the log are written beside and renamed. A full disk does not end a run: what could not be written is
-warned about, once each, and named in the result; the final values that are missing are named apart.
+as PLY; `final.xml` the scene, if the problem knows its file, and `final_files/` what that names. All but the
+log are written beside and renamed. A full disk does not end a run: what could not be written is warned about, once
+each, and named in the result; the final values that are missing are named apart.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ import numpy as np
 from psdr_jit.core import files
 from psdr_jit.core.compat import VERTEX_POSITIONS
 from psdr_jit.derivative import images
-from psdr_jit.errors import CheckpointError, OptionError, StorageError
+from psdr_jit.errors import CheckpointError, OptionError, SceneError, StorageError, UnsupportedError, UnsupportedWarning
+from psdr_jit.export.write import write_scene
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
 from psdr_jit.inverse.variables import numbers
@@ -31,6 +33,8 @@ from psdr_jit.scene.params import is_transform
 
 #: Views that the final strip shows, and samples per pixel of its images.
 SHOWN, STRIP_SPP = 3, 64
+
+FINAL = "final"  # name of the scene file
 
 VIEWS = "views"  # folder with the images of the strip, one per view
 
@@ -120,11 +124,23 @@ class Journal:
             return
         for name, content in {**_values(problem), "result.json": _summary(result)}.items():
             self.value(name, lambda name=name, content=content: files.write_bytes(self.folder / name, content))
+        self._scene(problem)
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
         self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows))
         self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
+
+    def _scene(self, problem: Any) -> None:
+        """The scene as a file; the values are saved already, so a scene that no file can hold is a warning."""
+        if problem.source is None:
+            return
+        name = f"{FINAL}.xml"
+        try:
+            self._try(name, lambda: write_scene(problem.scene, self.folder / name, problem.source))
+        except (UnsupportedError, SceneError) as error:
+            said = f"'{self.folder / name}' was not written, the values are in final.npz: {error}"
+            warnings.warn(said, UnsupportedWarning, stacklevel=4)
 
     def value(self, what: str, write: Callable[[], Any]) -> None:
         """Write something without which the run was in vain."""

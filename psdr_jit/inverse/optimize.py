@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,13 @@ def optimize(
     the scene's own path lengths. `settings`: fields of `inverse.settings.Settings`, such as `iterations`, `spp`,
     `views_per_step`, `seed`, `decay`.
 
-    With a folder `out`: a log, checkpoints, snapshots, pictures, and the final values are written there, and
-    `resume=True` goes on where an interrupted run of the same problem stopped, with the seeds and the moments that it
-    would have had. Ctrl-C ends the iteration, writes a checkpoint and returns.
+    With a folder `out`: a log, checkpoints, snapshots, pictures, the final values and, if `source` is given, the scene
+    file `final.xml` with them are written there, and `resume=True` goes on where an interrupted run of the same problem
+    stopped, with the seeds and the moments that it would have had. Ctrl-C ends the iteration, writes a checkpoint and
+    returns.
     `progress(done, total, note)` is called after every iteration; True shows a bar, None does so in notebooks.
     `client`: a `distributed.Client`, whose workers then render, view by view; `source`: the file that the scene was
-    loaded from. What a worker has begun is done by another one if it dies.
+    loaded from, with the defaults. What a worker has begun is done by another one if it dies.
 
     Raises `ParameterError`, `OptionError`, `SceneError` or `UnsupportedError` before the first iteration. Warns
     (`StalledWarning`) where the loss does not depend on a variable, and of a loss that diverges; the run then ends and
@@ -61,6 +63,7 @@ def optimize(
     if unknown:
         raise OptionError(f"there is no setting {', '.join(map(repr, unknown))}; there are {', '.join(sorted(known))}")
     problem = make_problem(scene, variables, targets, loss, integrator, Settings(**settings))
+    problem = replace(problem, source=SceneFile(source) if isinstance(source, str) else source)
     if client is not None:
         problem = with_crew(problem, client, source, integrator)
     with reporting("optimize", progress) as report:

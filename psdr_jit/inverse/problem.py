@@ -45,6 +45,7 @@ class Problem:
     own: Latents  # at the scene's own values
     fingerprint: str  # changes with whatever makes a stored state meaningless; targets apart
     target_means: np.ndarray  # by view: renders of one target may differ by rounding
+    source: Any = None  # the `SceneFile` that the scene was loaded from, if known
     crew: Any = None  # workers that evaluate it, see `remote`
 
     @property
