@@ -33,6 +33,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .derivative.make_plan import make_plan
     from .export.write import write_scene
     from .inverse.optimize import optimize
+    from .inverse.parts import Stage
     from .inverse.shapes import Profile, Vertices
     from .inverse.variables import Parameter, Pose
     from .plan.plan import Plan
@@ -49,6 +50,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "Pose",
         "Profile",
         "SceneFile",
+        "Stage",
         "Vertices",
         "check_gradient",
         "differentiable_params",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse import loop
+from psdr_jit.inverse.parts import Stage
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.remote import with_crew
 from psdr_jit.inverse.settings import Settings
@@ -23,9 +23,9 @@ from psdr_jit.inverse.variables import Variable
 
 @one_at_a_time
 def optimize(
-    scene: mi.Scene,
+    scene: mi.Scene | Sequence[Stage],
     variables: Variable | Sequence[Variable],
-    targets: Any,
+    targets: Any = None,
     *,
     loss: Any = "l2",
     integrator: Any = None,
@@ -42,6 +42,8 @@ def optimize(
     `inverse.variables.Variable`. `targets`: one image (H, W, C) of linear radiance for the first sensor, a list with
     one per sensor, or a dict by sensor index; arrays, Dr.Jit tensors, or names of image files. `loss`: "l1", "l2",
     "relative_l2", "dual_l2", a function of (image, target) that returns one number, or an `inverse.losses.Loss`.
+    Several scenes in one loss: a list of `psdr_jit.Stage(scene, targets, weight, name, source)` in place of `scene`,
+    and no `targets` beside. Losses add up; a variable acts on each scene that has its parameter (`inverse.parts`).
     `integrator`: as in `gradient`: an integrator, a dict of its properties, a plugin name, or None for `psdr_path` with
     the scene's own path lengths. `settings`: fields of `inverse.settings.Settings`, such as `iterations`, `spp`,
     `views_per_step`, `seed`, `decay`.
@@ -62,9 +64,11 @@ def optimize(
     unknown = sorted(set(settings) - known)
     if unknown:
         raise OptionError(f"there is no setting {', '.join(map(repr, unknown))}; there are {', '.join(sorted(known))}")
+    if not isinstance(scene, Sequence):
+        source = SceneFile(source) if isinstance(source, str) else source
+        scene, targets = [Stage(scene, targets, source=source)], None
     problem = make_problem(scene, variables, targets, loss, integrator, Settings(**settings))
-    problem = replace(problem, source=SceneFile(source) if isinstance(source, str) else source)
     if client is not None:
-        problem = with_crew(problem, client, source, integrator)
+        problem = with_crew(problem, client, integrator)
     with reporting("optimize", progress) as report:
         return loop.run(problem, None if out is None else Path(out), resume, report)
