@@ -100,7 +100,7 @@ def _different(scene: mi.Scene, other: dict[str, Any], rounding: float = 0.0) ->
     odd = sorted(own.keys() ^ other.keys())
     if odd:
         raise SceneError(f"the scene is not the one in the file: only one of them has '{odd[0]}'; name the file and "
-                         "the defaults that it was loaded with")  # fmt: skip
+                         "the defaults that it was loaded with, with optimize=False")  # fmt: skip
     return [name for name, value in own.items() if not _equal(value, other[name], rounding)]
 
 
