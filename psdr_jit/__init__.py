@@ -13,7 +13,7 @@ Symbols of the papers, and what they are called in the code (`_d`: attached to t
 Data flows one way, through the rooms (folders) in this order; each imports from those before it only:
 
     setup → core → scene → paths → plan → edges → sampling → interior, boundary → driver → plugins
-    → cluster → derivative → inverse → report → cli
+    → cluster → export → derivative → inverse → report → cli
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .derivative.check import CheckResult, check_gradient
     from .derivative.gradient import GradientResult, gradient
     from .derivative.make_plan import make_plan
+    from .export.write import write_scene
     from .inverse.optimize import optimize
+    from .inverse.parts import Stage
     from .inverse.shapes import Profile, Vertices
     from .inverse.variables import Parameter, Pose
     from .plan.plan import Plan
@@ -48,6 +50,7 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "Pose",
         "Profile",
         "SceneFile",
+        "Stage",
         "Vertices",
         "check_gradient",
         "differentiable_params",
@@ -56,4 +59,5 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
         "optimize",
         "scene_io",
         "traverse",
+        "write_scene",
     ]

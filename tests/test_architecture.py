@@ -20,7 +20,7 @@ LAST_RESORT = "cli.main"  # turns whatever arrives into one line and an exit sta
 
 ROOMS = (
     "errors", "options", "setup", "core", "scene", "paths", "plan", "edges", "sampling", "interior", "boundary",
-    "driver", "plugins", "cluster", "derivative", "inverse", "report", "cli",
+    "driver", "plugins", "cluster", "export", "derivative", "inverse", "report", "cli",
 )  # fmt: skip
 """Folders (and the modules that lie flat) in the order of import: each may import from those before it only."""
 

@@ -1,8 +1,9 @@
 """Recover parameters of a scene from images, as a TOML file says.
 
-Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
-checkpoint (a second one stops at once, without); --resume goes on from it with the same seeds and moments. Exit status:
-0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not be saved, 130 interrupted.
+Log, checkpoints, snapshots, pictures and the scene that was found, final.xml, go to a folder (see --out). Ctrl-C ends
+the current iteration and writes a checkpoint (a second one stops at once, without); --resume goes on from it with the
+same seeds and moments. Exit status: 0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not
+be saved, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -41,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, optimise, report."""
-    from psdr_jit.cluster.source import SceneFile
     from psdr_jit.inverse import config as configs
     from psdr_jit.inverse import loop
     from psdr_jit.inverse.remote import with_crew
@@ -58,12 +58,11 @@ def run(args: argparse.Namespace) -> int:
         config = configs.with_integrator(config, args.integrator)
     out = args.out or Path("out") / Path(args.config).stem
     loop.require_folder(out, args.resume)  # before targets are rendered
-    problem = configs.problem_of(config)
+    problem = configs.problem_of(config, args.send)
     start = time.perf_counter()
     with common.cluster(args) as client, progress.bar("optimize", args.quiet) as report:
         if client is not None:
-            source = SceneFile(str(config.scene), dict(config.defaults), args.send)
-            problem = with_crew(problem, client, source, config.integrator)
+            problem = with_crew(problem, client, config.integrator)
         result = loop.run(problem, out, args.resume, report)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))

@@ -72,9 +72,9 @@ def connected(address: str) -> Iterator[Any]:
 
 
 class Engine:
-    """A client and the scene that its workers are to have, as it is now."""
+    """A client and the scene that its workers are to have, as it is now. `at_once`: scenes that they should keep."""
 
-    def __init__(self, client: Any, scene: Any, source: SceneFile | str | None) -> None:
+    def __init__(self, client: Any, scene: Any, source: SceneFile | str | None, at_once: int = 1) -> None:
         if not isinstance(client, require_dask().Client):
             raise OptionError(f"client = {client!r:.60}: expected a distributed.Client")
         if source is None:
@@ -84,7 +84,7 @@ class Engine:
             )
         self.client = client
         parcel = parcel_of(SceneFile(source) if isinstance(source, str) else source)
-        self._at_first = Place(mi.variant(), parcel, _values(scene, parcel), worker.versions())
+        self._at_first = Place(mi.variant(), parcel, _values(scene, parcel), worker.versions(), at_once)
         self._said: set[str] = set()
         self._wait_for_workers()
         self.update({})
@@ -104,17 +104,22 @@ class Engine:
 
     def ordered(self, function: Callable[..., Any], units: Iterable[tuple]) -> Iterator[Any]:
         """`function(held, *unit)` for every unit, in order. Raises typed errors, of units those of the worker."""
-        futures = [self.client.submit(worker.work, function, self._place, *unit, pure=False) for unit in units]
-        try:
-            for k, future in enumerate(futures):
-                result, said = self._result(future)
-                self._warn(said)
-                yield result
-                futures[k] = None  # workers may forget it
-        finally:
-            for future in futures:
-                if future is not None and self.client.status == "running":
-                    future.cancel()
+        return together(function, [(self, unit) for unit in units])
+
+    def submit(self, function: Callable[..., Any], unit: tuple) -> Any:
+        """The future of a unit of work."""
+        return self.client.submit(worker.work, function, self._place, *unit, pure=False)
+
+    def finished(self, future: Any) -> Any:
+        """The result of a future, once it is there; warnings are said here."""
+        result, said = self._result(future)
+        self._warn(said)
+        return result
+
+    def forget(self, future: Any) -> None:
+        """What nobody waits for any more."""
+        if self.client.status == "running":
+            future.cancel()
 
     def _result(self, future: Any) -> Any:
         from distributed.client import FutureCancelledError
@@ -154,6 +159,19 @@ class Engine:
                 f"the scheduler at '{self.client.scheduler.address}' has no workers after {PATIENCE:.0f} s: start some "
                 "with 'dask worker ADDRESS --nthreads 1'"
             ) from error
+
+
+def together(function: Callable[..., Any], units: Iterable[tuple[Engine, tuple]]) -> Iterator[Any]:
+    """`function(held, *unit)` for units with scenes of their own, all handed out at once; see `Engine.ordered`."""
+    futures = [(engine, engine.submit(function, unit)) for engine, unit in units]
+    try:
+        while futures:
+            engine, future = futures[0]
+            yield engine.finished(future)
+            futures.pop(0)  # workers may forget it
+    finally:
+        for engine, future in futures:
+            engine.forget(future)
 
 
 def _same(place: Place) -> Place:

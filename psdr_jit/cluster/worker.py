@@ -1,6 +1,7 @@
-"""What runs on a worker: it keeps one scene, puts it where the caller's stands, and does a unit of work with it.
+"""What runs on a worker: it keeps a scene, puts it where the caller's stands, and does a unit of work with it.
 
-One scene only: two of them with gradients in one process would be traversed together by Dr.Jit's virtual calls.
+No more scenes than the caller works with at once: Dr.Jit's virtual calls reach every one that is alive, which makes
+kernels larger. Gradients are enabled in one of them at a time, and not any more when a unit is done.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ class Place:
     parcel: Parcel
     values: Values = field(repr=False)
     versions: dict[str, str]
+    at_once: int = 1  # scenes that the caller works with
 
 
-@dataclass
+@dataclass(eq=False)
 class Held:
-    """The scene that this process has."""
+    """A scene that this process has."""
 
     variant: str
     digest: str
@@ -79,17 +81,30 @@ def require_versions(wanted: dict[str, str]) -> None:
 
 
 def hold(place: Place) -> Held:
-    """The scene, loaded if another was held, with the parameters of `place`."""
-    if not _HELD or (_HELD[0].variant, _HELD[0].digest) != (place.variant, place.parcel.digest):
-        _HELD.clear()
+    """The scene, loaded if it is not held, with the parameters of `place`."""
+    if _let_go(place):
         gc.collect()  # Dr.Jit's virtual calls reach every scene that is alive
+    if not _HELD or not _is(_HELD[-1], place):
         if mi.variant() != place.variant:
             use_variant(place.variant)
         _share_cores()
         _HELD.append(Held(place.variant, place.parcel.digest, place.parcel.load(), {}, {}, {}))
-    held = _HELD[0]
+    held = _HELD[-1]
     _apply(held, place.values)
     return held
+
+
+def _is(held: Held, place: Place) -> bool:
+    return (held.variant, held.digest) == (place.variant, place.parcel.digest)
+
+
+def _let_go(place: Place) -> bool:
+    """Put the scene of `place` last, if it is held, and forget the oldest ones that are too many: were there any?"""
+    own = [held for held in _HELD if _is(held, place)]
+    others = [held for held in _HELD if held.variant == place.variant and held not in own]
+    before = len(_HELD)
+    _HELD[:] = [*others[max(0, len(others) - place.at_once + 1) :], *own]
+    return len(_HELD) < before
 
 
 def _apply(held: Held, values: Values) -> None:

@@ -24,19 +24,32 @@ defaults = { mesh = "other.ply" }
 kind = "pose"
 parameter = "box.vertex_positions"
 learning_rate = 0.01              # and the other fields of `Parameter`, `Pose`, `Vertices`, `Profile`
+
+Several scenes in one loss, instead of scene = "..." and [[target]]; variables act on every one that has the parameter,
+or on one alone, as in parameter = "evening:lamp.position":
+
+[[scene]]
+file = "evening.xml"
+name = "evening"                  # unless given, that of the file
+weight = 0.5                      # of its loss in the sum
+defaults = { res = 32 }           # beside those of all scenes
+[[scene.target]]                  # one or more, as above
+render = 256
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from psdr_jit.cluster.source import SceneFile
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse.losses import LOSSES
+from psdr_jit.inverse.parts import Stage
 from psdr_jit.inverse.problem import Problem, make_problem
 from psdr_jit.inverse.settings import Settings, is_number
 from psdr_jit.inverse.shapes import Profile, Vertices
@@ -52,6 +65,16 @@ EXPECTED = {int: "a whole number", str: "a text", Mapping: "a table", (int, list
 
 
 @dataclass(frozen=True)
+class SceneTable:
+    """A [[scene]]: one of several."""
+
+    file: Path
+    name: str = ""
+    weight: float = 1.0
+    defaults: Mapping[str, Any] = field(default_factory=dict)  # beside those of all scenes
+
+
+@dataclass(frozen=True)
 class Config:
     """A checked file; paths are absolute."""
 
@@ -60,9 +83,10 @@ class Config:
     loss: str
     defaults: Mapping[str, Any]
     integrator: Mapping[str, Any]
-    targets: tuple[Mapping[str, Any], ...]
+    targets: tuple[Mapping[str, Any], ...]  # of all scenes
     variables: tuple[Any, ...]
     settings: Settings
+    scenes: tuple[SceneTable, ...] = ()  # if there are several; `scene` is the first then
 
 
 def read(path: str | Path, **changes: Any) -> Config:
@@ -91,18 +115,25 @@ def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config
     setting_names = [f.name for f in fields(Settings)]
     _unknown("", content, [*TABLES, *setting_names], wrong)
     tables = {name: _table(content, name, wrong) for name in ("defaults", "integrator")}
-    for name in ("target", "variable"):
+    several = isinstance(content.get("scene"), list)
+    for name in ("variable",) if several else ("target", "variable"):
         if not isinstance(content.get(name), list) or not all(isinstance(x, Mapping) for x in content[name]):
             wrong.append(f"there must be at least one [[{name}]]")
-    scene = path.parent / str(content.get("scene", ""))
+    listed = _tables(content, "scene")
+    scenes = tuple(_scene(path, k, table, wrong) for k, table in enumerate(listed))
+    if several and "target" in content:
+        wrong.append("[[target]] does not say of which scene: several scenes have a [[scene.target]] each")
+    scene = scenes[0].file if scenes else path.parent / str(content.get("scene", ""))
     if "scene" not in content:
         wrong.append('scene = "..." is missing')
-    elif not scene.is_file():
+    elif not several and not scene.is_file():
         wrong.append(f"scene = {content['scene']!r}: there is no file '{scene}'")
     loss = content.get("loss", "l2")
     if not isinstance(loss, str) or loss not in LOSSES:
         wrong.append(f"loss = {loss!r}: expected one of {', '.join(LOSSES)}")
-    targets = [_target(path, k, t, wrong) for k, t in enumerate(_tables(content, "target"))]
+    owners = listed if several else [content]
+    targets = [{**_target(path, k, target, wrong), "stage": stage}
+               for stage, owner in enumerate(owners) for k, target in enumerate(_tables(owner, "target"))]  # fmt: skip
     variables = [_variable(k, v, wrong) for k, v in enumerate(_tables(content, "variable"))]
     integrator = {"type": integrator_specs.DEFAULT_INTEGRATOR, **tables["integrator"]}
     if integrator["type"] == integrator_specs.DEFAULT_INTEGRATOR:
@@ -112,7 +143,8 @@ def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config
     except OptionError as error:
         wrong += str(error).split("; ")
         return None
-    return Config(path, scene, loss, tables["defaults"], integrator, tuple(targets), tuple(variables), settings)
+    return Config(path, scene, loss, tables["defaults"], integrator, tuple(targets), tuple(variables), settings,
+                  scenes)  # fmt: skip
 
 
 def _table(content: Mapping[str, Any], name: str, wrong: list[str]) -> Mapping[str, Any]:
@@ -133,6 +165,26 @@ def _unknown(where: str, table: Mapping[str, Any], known: list[str], wrong: list
         if key not in known:
             close = difflib.get_close_matches(key, known, n=1)
             wrong.append(f"{where}there is no key '{key}'{f'; did you mean {close[0]!r}?' if close else ''}")
+
+
+def _scene(path: Path, k: int, table: Mapping[str, Any], wrong: list[str]) -> SceneTable:
+    where = f"[[scene]] {k + 1}: "
+    _unknown(where, table, ["file", "name", "weight", "defaults", "target"], wrong)
+    file = path.parent / str(table.get("file", ""))
+    if "file" not in table:
+        wrong.append(f'{where}file = "..." is missing')
+    elif not file.is_file():
+        wrong.append(f"{where}there is no file '{file}'")
+    weight, name, defaults = table.get("weight", 1.0), table.get("name", file.stem), table.get("defaults", {})
+    if not is_number(weight) or not weight > 0:
+        wrong.append(f"{where}weight = {weight!r}: expected a number above 0")
+    if not isinstance(name, str):
+        wrong.append(f"{where}name = {name!r}: expected a text")
+    if not isinstance(defaults, Mapping):
+        wrong.append(f"{where}defaults = {defaults!r}: expected a table")
+    if not _tables(table, "target"):
+        wrong.append(f"{where}there must be at least one [[scene.target]]")
+    return SceneTable(file, name, weight, defaults)
 
 
 def _target(path: Path, k: int, table: Mapping[str, Any], wrong: list[str]) -> dict[str, Any]:
@@ -198,24 +250,33 @@ ACCEPTED = {  # annotation of a variable's field: what to call its values, and w
 }
 
 
-def problem_of(config: Config) -> Problem:
-    """Load the scene, render or read the targets. Raises what loading and checking raise."""
-    scene = scene_io.load_scene(config.scene, **config.defaults)
-    integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, config.integrator))
+def problem_of(config: Config, send: bool = False) -> Problem:
+    """Load the scenes, render or read the targets; `send`: to workers. Raises what loading and checking raise."""
+    tables = config.scenes or (SceneTable(config.scene),)
+    stages = [_stage(config, k, replace(table, defaults={**config.defaults, **table.defaults}), send)
+              for k, table in enumerate(tables)]  # fmt: skip
+    return make_problem(stages, config.variables, None, config.loss, config.integrator, config.settings)
+
+
+def _stage(config: Config, k: int, table: SceneTable, send: bool) -> Stage:
+    """One scene with its targets, which are rendered as the file says."""
+    scene = scene_io.load_scene(table.file, **table.defaults)
+    integrator_specs.build(integrator_specs.integrator_spec(scene, config.integrator))  # raises before rendering
     kept = {key: value for key, value in config.integrator.items() if key in integrator_specs.PATH_OPTIONS}
     spec = integrator_specs.integrator_spec(scene, kept | {"type": integrator_specs.DEFAULT_INTEGRATOR})
     path = integrator_specs.build(spec)
     targets: dict[int, Any] = {}
-    for target in config.targets:
+    for target in (target for target in config.targets if target["stage"] == k):
         source = scene
         if "scene" in target or "defaults" in target:
-            defaults = {**config.defaults, **target.get("defaults", {})}
-            source = scene_io.load_scene(target.get("scene", config.scene), **defaults)
+            defaults = {**table.defaults, **target.get("defaults", {})}
+            source = scene_io.load_scene(target.get("scene", table.file), **defaults)
         for sensor in target["sensor"]:
             if sensor in targets:
                 raise OptionError(f"'{config.path}': sensor {sensor} has two targets")
             targets[sensor] = target["file"] if "file" in target else rendered(source, sensor, path, target["render"])
-    return make_problem(scene, config.variables, targets, config.loss, integrator, config.settings)
+    source = SceneFile(str(table.file), dict(table.defaults), send)
+    return Stage(scene, targets, table.weight, table.name, source)
 
 
 def with_integrator(config: Config, plugin: str) -> Config:

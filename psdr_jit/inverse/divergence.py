@@ -32,9 +32,9 @@ class Watch:
     def __init__(self, problem: Problem) -> None:
         points = [_origin(view.sensor.world_transform()) for view in problem.views]
         points += [p for p in map(lambda name: _points(problem, name), problem.variables) if p is not None]
-        box = problem.scene.bbox()
-        if box.valid():
-            points += [numbers(box.min)[None], numbers(box.max)[None]]
+        for box in (part.scene.bbox() for part in problem.parts):
+            if box.valid():
+                points += [numbers(box.min)[None], numbers(box.max)[None]]
         around = np.concatenate(points)
         self.centre = (around.min(0) + around.max(0)) / 2
         self.diameter = 2 * float(np.linalg.norm(around - self.centre, axis=1).max())
@@ -68,7 +68,7 @@ class Watch:
 
 def _points(problem: Problem, name: str) -> np.ndarray | None:
     """Positions (N, 3) that a parameter consists of; None if it is something else."""
-    value = problem.params[name]
+    value = problem.value(name)
     if is_transform(value):
         return _origin(value) if value.matrix.shape[0] == 4 else None
     if not name.endswith(("position", "positions")):

@@ -2,8 +2,9 @@
 
 `log.jsonl` has one object per iteration; `checkpoint.npz` the state; `snapshots/` images; `views/` the images before
 and after; `result.png` a strip of them; `curves.png` loss and offsets; `final.npz` the values of all variables, meshes
-as PLY. All but the log are written beside and renamed. A full disk does not end a run: what could not be written is
-warned about, once each, and named in the result; the final values that are missing are named apart.
+as PLY; `final.xml` the scene, if the problem knows its file, and `final_files/` what that names. All but the
+log are written beside and renamed. A full disk does not end a run: what could not be written is warned about, once
+each, and named in the result; the final values that are missing are named apart.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ import numpy as np
 from psdr_jit.core import files
 from psdr_jit.core.compat import VERTEX_POSITIONS
 from psdr_jit.derivative import images
-from psdr_jit.errors import CheckpointError, OptionError, StorageError
+from psdr_jit.errors import CheckpointError, OptionError, SceneError, StorageError, UnsupportedError, UnsupportedWarning
+from psdr_jit.export import assets
+from psdr_jit.export.write import write_scene
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
 from psdr_jit.inverse.variables import numbers
@@ -31,6 +34,8 @@ from psdr_jit.scene.params import is_transform
 
 #: Views that the final strip shows, and samples per pixel of its images.
 SHOWN, STRIP_SPP = 3, 64
+
+FINAL = "final"  # name of the scene file
 
 VIEWS = "views"  # folder with the images of the strip, one per view
 
@@ -120,11 +125,19 @@ class Journal:
             return
         for name, content in {**_values(problem), "result.json": _summary(result)}.items():
             self.value(name, lambda name=name, content=content: files.write_bytes(self.folder / name, content))
+        self._scene(problem)
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
         self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows))
         self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
+
+    def _scene(self, problem: Any) -> None:
+        """The scenes as files; the values are saved already, so a scene that no file can hold is a warning."""
+        for part in problem.parts:
+            if part.source is not None:
+                name = f"{FINAL}_{part.name}.xml" if part.name else f"{FINAL}.xml"
+                self._try(name, lambda part=part, name=name: _write_scene(part, self.folder / name))
 
     def value(self, what: str, write: Callable[[], Any]) -> None:
         """Write something without which the run was in vain."""
@@ -158,9 +171,18 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
     return found
 
 
+def _write_scene(part: Any, path: Path) -> None:
+    try:
+        write_scene(part.scene, path, part.source)
+    except (UnsupportedError, SceneError) as error:
+        said = f"'{path}' was not written, the values are in final.npz: {error}"
+        warnings.warn(said, UnsupportedWarning, stacklevel=6)
+
+
 def _look(problem: Any, view: Any) -> np.ndarray:
+    part = problem.parts[view.part]
     with dr.suspend_grad():
-        return np.array(problem.integrator.render(problem.scene, view.sensor, seed=SEED, spp=STRIP_SPP))
+        return np.array(part.integrator.render(part.scene, view.sensor, seed=SEED, spp=STRIP_SPP))
 
 
 def _write_views(folder: Path, rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> None:
@@ -177,16 +199,16 @@ def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray]) -> 
 
 def _values(problem: Any) -> dict[str, bytes]:
     """Files by name: values by parameter (poses (4, 4), vertices (V, 3), the rest in its own shape), and meshes."""
-    values = io.BytesIO()
-    np.savez(values, **{name: _value(name, problem.params[name]) for name in problem.variables})
-    found = {"final.npz": values.getvalue()}
-    for name in problem.variables:
-        node = problem.params.properties[name][2]
-        if name.endswith(VERTEX_POSITIONS) and isinstance(node, mi.Mesh):
-            mesh = mi.MemoryStream()  # not a file: Mitsuba does not notice when the last of it is lost
-            node.write_ply(mesh)
-            found[f"{node.id()}.ply"] = mesh.raw_buffer()
-    return found
+    values, found = {}, {}
+    for part in problem.parts:
+        for name in (variable.parameter for variable in part.variables.values()):
+            values[part.label(name, ":")] = _value(name, part.params[name])
+            node = part.params.properties[name][2]
+            if name.endswith(VERTEX_POSITIONS) and isinstance(node, mi.Mesh):
+                found[f"{part.label(node.id())}.ply"] = assets.mesh(node)
+    content = io.BytesIO()
+    np.savez(content, **values)
+    return {"final.npz": content.getvalue(), **found}
 
 
 def _value(name: str, value: Any) -> np.ndarray:

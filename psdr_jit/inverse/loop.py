@@ -290,7 +290,7 @@ def _watch(problem: Problem, state: _State, label: str, norm: float) -> None:
     count = state.lost[label] = 0 if usable else state.lost.get(label, 0) + 1
     if norm != 0 or count != problem.settings.stalled_after:
         return
-    plan = getattr(problem.integrator, "plan", None)
+    plan = getattr(problem.home(label.rpartition(" (")[0]).integrator, "plan", None)
     terms = [f"{t.name} {'runs' if t.runs else 'is out'}: {t.reason}" for t in plan.terms] if plan is not None else []
     reason = f"; the latest plan: {'; '.join(terms)}" if terms else ""
     said = (

@@ -1,11 +1,11 @@
-"""One optimisation as a whole: scene, views, variables, loss. Evaluates loss and gradient, and does not step."""
+"""One optimisation as a whole: scenes, views, variables, loss. Evaluates loss and gradient, and does not step."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -14,14 +14,13 @@ import numpy as np
 
 from psdr_jit.core.film import require_samples
 from psdr_jit.core.upload import in_memory
-from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
+from psdr_jit.inverse.parts import Part, Stage, begun, parts_of
 from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import View, views
 from psdr_jit.inverse.variables import Variable
-from psdr_jit.scene.guard import require_derivatives, require_integrator, require_scene
-from psdr_jit.scene.names import stable_name, traverse
+from psdr_jit.scene.guard import require_derivatives, require_scene
 from psdr_jit.scene.params import is_transform, parameter_value
 
 Latents = dict[str, dict[str, Any]]  # by parameter, by latent
@@ -33,19 +32,46 @@ IMAGES = (TARGET_IMAGE, SECOND_IMAGE)
 
 @dataclass(frozen=True)
 class Problem:
-    """A scene whose `variables` are to make every sensor see its target."""
+    """Scenes whose `variables` are to make every sensor see its target."""
 
-    scene: mi.Scene
-    params: Any
+    parts: tuple[Part, ...]
     views: tuple[View, ...]
-    variables: dict[str, Variable]  # by parameter
+    variables: dict[str, Variable]  # by parameter; of the first scene that each acts on
     loss: Loss
-    integrator: Any
     settings: Settings
     own: Latents  # at the scene's own values
     fingerprint: str  # changes with whatever makes a stored state meaningless; targets apart
     target_means: np.ndarray  # by view: renders of one target may differ by rounding
     crew: Any = None  # workers that evaluate it, see `remote`
+
+    @property
+    def scene(self) -> mi.Scene:
+        """The first one."""
+        return self.parts[0].scene
+
+    @property
+    def params(self) -> Any:
+        """Parameters of the first scene."""
+        return self.parts[0].params
+
+    @property
+    def integrator(self) -> Any:
+        """Of the first scene."""
+        return self.parts[0].integrator
+
+    def home(self, name: str) -> Part:
+        """The first scene that a variable acts on."""
+        return next(part for part in self.parts if name in part.variables)
+
+    def value(self, name: str) -> Any:
+        """The parameter that follows from a variable, in its first scene."""
+        home = self.home(name)
+        return home.params[home.variables[name].parameter]
+
+    def node(self, name: str) -> Any:
+        """The object that this parameter belongs to."""
+        home = self.home(name)
+        return home.params.properties[home.variables[name].parameter][2]
 
     @property
     def period(self) -> int:
@@ -75,16 +101,22 @@ class Problem:
         return int(state[0])
 
     def apply(self, latents: Mapping[str, Mapping[str, Any]]) -> None:
-        """Put the scene where the latents say; attached if they are."""
-        for name, variable in self.variables.items():
-            self.params[name] = in_memory(variable.value(latents[name]))
-            self.params.set_dirty(name)  # equal values are skipped, but an attached one must replace a detached one
-        self.params.update()
+        """Put the scenes where the latents say; attached if they are."""
+        for part in self.parts:
+            for name, variable in part.variables.items():
+                part.params[variable.parameter] = in_memory(variable.value(latents[name]))
+                # equal values are skipped, but an attached one must replace a detached one
+                part.params.set_dirty(variable.parameter)
+            part.params.update()
+
+    def factor(self, view: int, chosen: Sequence[int]) -> float:
+        """Of a view's loss in that of an iteration which sees the `chosen` ones; right on average over these."""
+        return self.views[view].share * len(self.views) / len(chosen)
 
     def evaluate(self, iteration: int) -> tuple[float, dict[int, np.ndarray]]:
         """Loss of the views of an iteration; its gradient is added to that of the scene's parameters.
 
-        All views see one state of the scene. Their gradients meet in its parameters, and only then go on to the
+        All views see one state of the scenes. Their gradients meet in the parameters, and only then go on to the
         latents: else the first view would use up the graph between them. A loss that is not finite, or whose
         derivative by the image is not, ends this with NaN and leaves the rest undone.
         """
@@ -98,19 +130,20 @@ class Problem:
                 images[k] = image
                 if not (np.isfinite(loss) and dr.all(dr.isfinite(grad), axis=None)):
                     return float("nan"), images
-                total += loss / len(chosen)
-                self.integrator.render_backward(
-                    self.scene, self.params, grad / len(chosen), sensor=self.views[k].sensor,
+                part, factor = self.parts[self.views[k].part], self.factor(k, chosen)
+                total += loss * factor
+                part.integrator.render_backward(
+                    part.scene, part.params, grad * factor, sensor=self.views[k].sensor,
                     seed=self.seed(iteration, k, GRADIENT), spp=self.settings.gradient_spp or self.settings.spp,
                 )  # fmt: skip
         return total, images
 
     def _view(self, iteration: int, k: int) -> tuple[float, np.ndarray, mi.TensorXf]:
         """Loss of one view, its image, and the derivative of the loss by the image."""
-        images = []
+        images, part = [], self.parts[self.views[k].part]
         with dr.suspend_grad():
             for purpose in IMAGES[: self.loss.images]:
-                image = self.integrator.render(self.scene, self.views[k].sensor, seed=self.seed(iteration, k, purpose),
+                image = part.integrator.render(part.scene, self.views[k].sensor, seed=self.seed(iteration, k, purpose),
                                                spp=self.settings.spp)  # fmt: skip
                 images.append(mi.TensorXf(dr.detach(image)))
         loss, grad = self.loss_of(k, images)
@@ -155,58 +188,72 @@ def copied(latents: Mapping[str, Mapping[str, Any]]) -> Latents:
 
 
 def make_problem(
-    scene: mi.Scene,
+    scene: mi.Scene | Sequence[Stage],
     variables: Sequence[Variable] | Variable,
     targets: Any,
     loss: Any,
     integrator: Any,
     settings: Settings,
 ) -> Problem:
-    """Everything checked; raises typed errors before anything is rendered in a loop."""
+    """Everything checked; raises typed errors before anything is rendered in a loop.
+
+    `scene`: one, with its `targets`, or a list of stages, which have targets of their own.
+    """
     require_derivatives()
-    require_scene(scene)
+    stages = _stages(scene, targets)
     chosen = list(variables) if isinstance(variables, Sequence) else [variables]
-    names = [v.parameter for v in chosen]
     if not chosen:
         raise OptionError("there is no variable: name at least one scene parameter to optimise")
-    keys = [stable_name(scene, name) for name in names]
-    twice = sorted({key for key in keys if keys.count(key) > 1})
-    if twice:
-        raise OptionError(f"parameter '{twice[0]}' belongs to several variables; give each parameter one")
-    found = tuple(views(scene, targets))
+    parts = parts_of(chosen, stages, integrator)
+    found = tuple(view for k, stage in enumerate(stages) for view in _views(k, stage, parts[k]))
     for view in found:
         require_samples(view.sensor, max(settings.spp, settings.gradient_spp))
-    params = traverse(scene, names)
-    own = {v.parameter: v.begin(scene, params) for v in chosen}
+    own = begun(parts)
     for variable in chosen:
         for latent, rate in variable.learning_rates.items():
             if not 0 < rate < np.inf:
                 raise OptionError(
                     f"'{variable.parameter}': the learning rate of its {latent} must be above 0 and finite, got {rate}"
                 )
-    require_integrator(integrator)
-    if not hasattr(integrator, "render_backward"):
-        integrator = integrator_specs.build(integrator_specs.integrator_spec(scene, integrator))
-    by_name = {v.parameter: v for v in chosen}
+    by_name = {v.parameter: next(p.variables[v.parameter] for p in parts if v.parameter in p.variables) for v in chosen}
     loss = find_loss(loss)
-    digest = _fingerprint(params, by_name, found, loss, integrator, settings)
+    digest = _fingerprint(parts, by_name, found, loss, settings)
     means = np.array([np.mean(np.array(view.target)) for view in found])
-    return Problem(scene, params, found, by_name, loss, integrator, settings, own, digest, means)
+    return Problem(parts, found, by_name, loss, settings, own, digest, means)
 
 
-def _fingerprint(params: Any, variables: Any, found: Any, loss: Loss, integrator: Any, settings: Settings) -> str:
-    """Of everything that was asked for, and of the scene."""
+def _stages(scene: Any, targets: Any) -> list[Stage]:
+    if isinstance(scene, Sequence):
+        if targets is not None:
+            raise OptionError("several scenes have targets each: give them to psdr_jit.Stage, and none beside")
+        return list(scene)
+    require_scene(scene)
+    return [Stage(scene, targets)]
+
+
+def _views(k: int, stage: Stage, part: Part) -> list[View]:
+    """Views of a scene; its loss is their mean."""
+    found = views(stage.scene, stage.targets)
+    return [replace(view, part=k, share=stage.weight / len(found), name=part.label(view.name)) for view in found]
+
+
+def _fingerprint(parts: Sequence[Part], variables: Any, found: Sequence[View], loss: Loss, settings: Settings) -> str:
+    """Of everything that was asked for, and of the scenes."""
     ignored = {"iterations", "checkpoint_every", "snapshot_every", "max_seconds"}  # may change on resuming
     asked = {key: value for key, value in asdict(settings).items() if key not in ignored}
     kinds = {name: [type(v).__name__, _asked(v), dict(v.learning_rates)] for name, v in variables.items()}
     digest = hashlib.sha256()
-    whole = [asked, kinds, [view.name for view in found], loss.name, str(integrator)]
+    whole = [asked, kinds, [view.name for view in found], loss.name, *(str(part.integrator) for part in parts)]
+    if len(parts) > 1:
+        whole.append([[part.name, list(part.variables)] for part in parts])
+        whole.append([view.share for view in found])
     digest.update(json.dumps(whole, sort_keys=True, default=str).encode())
-    for name in sorted(params.keys()):
-        value = parameter_value(params, name)
-        value = value.matrix if is_transform(value) else value
-        digest.update(name.encode())
-        digest.update(np.array(dr.detach(value)).tobytes() if dr.is_array_v(value) else repr(value).encode())
+    for part in parts:
+        for name in sorted(part.params.keys()):
+            value = parameter_value(part.params, name)
+            value = value.matrix if is_transform(value) else value
+            digest.update(name.encode())
+            digest.update(np.array(dr.detach(value)).tobytes() if dr.is_array_v(value) else repr(value).encode())
     return digest.hexdigest()
 
 

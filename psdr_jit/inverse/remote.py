@@ -15,8 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from psdr_jit.cluster.engine import Engine
-from psdr_jit.cluster.source import SceneFile
+from psdr_jit.cluster.engine import Engine, together
 from psdr_jit.cluster.values import from_numpy, to_numpy
 from psdr_jit.cluster.worker import Held
 from psdr_jit.derivative import integrator_specs
@@ -69,50 +68,75 @@ def _shaped(value: Any, grad: np.ndarray) -> np.ndarray:
     return grad.reshape(grad.shape[:2]) if is_transform(value) else grad
 
 
-class Crew:
-    """Workers that evaluate a problem. With a plan, form and samples per term are those of a pilot at the start."""
+class _Hands:
+    """Workers for one scene of a problem. With a plan, form and samples per term are those of a pilot at the start."""
 
-    def __init__(self, engine: Engine, problem: Problem, integrator: Any) -> None:
+    def __init__(self, client: Any, problem: Problem, k: int, integrator: Any) -> None:
+        part = problem.parts[k]
+        self.engine = Engine(client, part.scene, part.source, at_once=len(problem.parts))
+        self.part, self.names = part, [variable.parameter for variable in part.variables.values()]
+        self.sensors = {view: sensor_index(part.scene, found.sensor)
+                        for view, found in enumerate(problem.views) if found.part == k}  # fmt: skip
+        self.spp = problem.settings.gradient_spp or problem.settings.spp
+        self.spec = integrator_specs.integrator_spec(part.scene, integrator)
+        table = integrator_specs.term_table(self.spec["type"])
+        own = {"plan", *(budget for _, budget in table)} & self.spec.keys()
+        if self.spec["type"] in integrator_specs.OURS and not own and self.names:
+            first = next(iter(self.sensors.values()))
+            plan = make_plan(part.scene, self.names, first, self.spec, self.spp)
+            budgets = {budget: plan.term(name).spp or self.spp for name, budget in table}
+            self.spec |= {"form": plan.form, **budgets}
+            self.spp = 0  # those of the terms
+
+    def update(self) -> None:
+        """Let them see the parameters as they are now."""
+        self.engine.update({name: to_numpy(self.part.params[name]) for name in self.names})
+
+
+class Crew:
+    """Workers that evaluate a problem."""
+
+    def __init__(self, client: Any, problem: Problem, integrator: Any) -> None:
         if hasattr(integrator, "render_backward"):
             raise OptionError("workers make integrators of their own: give its properties as a dict, or its name")
-        self._engine = engine
-        self._sensors = [sensor_index(problem.scene, view.sensor) for view in problem.views]
-        self._spp = problem.settings.gradient_spp or problem.settings.spp
-        self._spec = integrator_specs.integrator_spec(problem.scene, integrator)
-        table = integrator_specs.term_table(self._spec["type"])
-        own = {"plan", *(budget for _, budget in table)} & self._spec.keys()
-        if self._spec["type"] in integrator_specs.OURS and not own:
-            plan = make_plan(problem.scene, list(problem.variables), self._sensors[0], self._spec, self._spp)
-            budgets = {budget: plan.term(name).spp or self._spp for name, budget in table}
-            self._spec |= {"form": plan.form, **budgets}
-            self._spp = 0  # those of the terms
+        self._hands = [_Hands(client, problem, k, integrator) for k in range(len(problem.parts))]
 
     def evaluate(self, problem: Problem, iteration: int) -> tuple[float, dict[int, np.ndarray]]:
         """See `Problem.evaluate`."""
-        chosen, names = problem.chosen(iteration), list(problem.variables)
-        self._engine.update({name: to_numpy(problem.params[name]) for name in names})
+        chosen = problem.chosen(iteration)
+        for hands in self._hands:
+            hands.update()
         images = self._images(problem, iteration, chosen)
-        total, grads = 0.0, []
+        total, units = 0.0, []
         for k in chosen:
             loss, grad = problem.loss_of(k, images[k])
             if not (np.isfinite(loss) and dr.all(dr.isfinite(grad), axis=None)):
                 return float("nan"), {k: np.array(images[k][0]) for k in chosen}
-            total += loss / len(chosen)
-            view = self._sensors[k], self._spp, problem.seed(iteration, k, GRADIENT)
-            grads.append((names, self._spec, np.array(grad / len(chosen)), view))
-        sums = dict.fromkeys(names, 0.0)
-        for found in self._engine.ordered(gradient_unit, grads):
-            sums = {name: sums[name] + found[name].astype(np.float64) for name in names}
-        for name, grad in sums.items():
-            _go_on(problem.params[name], grad)
+            factor, hands = problem.factor(k, chosen), self._of(problem, k)
+            total += loss * factor
+            view = hands.sensors[k], hands.spp, problem.seed(iteration, k, GRADIENT)
+            units.append((hands.engine, (hands.names, hands.spec, np.array(grad * factor), view)))
+        sums = [dict.fromkeys(hands.names, 0.0) for hands in self._hands]
+        for k, found in zip(chosen, together(gradient_unit, units), strict=True):
+            part = sums[problem.views[k].part]
+            part |= {name: part[name] + grad.astype(np.float64) for name, grad in found.items()}
+        for hands, grads in zip(self._hands, sums, strict=True):
+            for name, grad in grads.items():
+                if isinstance(grad, np.ndarray):  # some view of this scene was seen
+                    _go_on(hands.part.params[name], grad)
         return total, {k: np.array(images[k][0]) for k in chosen}
+
+    def _of(self, problem: Problem, view: int) -> _Hands:
+        return self._hands[problem.views[view].part]
 
     def _images(self, problem: Problem, iteration: int, chosen: Sequence[int]) -> dict[int, list[mi.TensorXf]]:
         """Images by view, as many as the loss wants to see."""
-        purposes = IMAGES[: problem.loss.images]
-        units = [(self._spec, (self._sensors[k], problem.settings.spp, problem.seed(iteration, k, purpose)))
-                 for k in chosen for purpose in purposes]  # fmt: skip
-        found = self._engine.ordered(image_unit, units)
+        purposes, units = IMAGES[: problem.loss.images], []
+        for k in chosen:
+            hands = self._of(problem, k)
+            views = [(hands.sensors[k], problem.settings.spp, problem.seed(iteration, k, p)) for p in purposes]
+            units += [(hands.engine, (hands.spec, view)) for view in views]
+        found = together(image_unit, units)
         return {k: [mi.TensorXf(np.array(next(found))) for _ in purposes] for k in chosen}
 
 
@@ -125,6 +149,6 @@ def _go_on(value: Any, grad: np.ndarray) -> None:
         dr.backward(dr.sum(value * from_numpy(dr.detach(value), grad), axis=None))
 
 
-def with_crew(problem: Problem, client: Any, source: SceneFile | str | None, integrator: Any) -> Problem:
-    """The problem, evaluated by the workers of a Dask client. `source`: where its scene is from."""
-    return replace(problem, crew=Crew(Engine(client, problem.scene, source), problem, integrator))
+def with_crew(problem: Problem, client: Any, integrator: Any) -> Problem:
+    """The problem, evaluated by the workers of a Dask client, who must know where its scenes are from."""
+    return replace(problem, crew=Crew(client, problem, integrator))

@@ -30,11 +30,13 @@ LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 
 @dataclass(frozen=True)
 class View:
-    """A sensor of the scene, and the image (H, W, C) that it should see."""
+    """A sensor of a scene, and the image (H, W, C) that it should see."""
 
     sensor: mi.Sensor
     target: mi.TensorXf
     name: str
+    part: int = 0  # which of several scenes
+    share: float = 1.0  # of its loss in that of the problem
 
 
 def view(scene: mi.Scene, sensor: Any, target: Any) -> View:

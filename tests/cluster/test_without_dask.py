@@ -68,6 +68,21 @@ def test_parameters_follow_the_caller_and_come_back(llvm):
     worker._HELD.clear()
 
 
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_as_many_scenes_are_kept_as_the_caller_works_with(llvm, at_once):
+    """Loading again for every unit would be slow, keeping more than that would fill the memory."""
+    files = [SceneFile(FILE, {"res": res, "max_depth": 2}) for res in (4, 5, 6)]
+    places = [Place("llvm_ad_rgb", parcel_of(file), {}, worker.versions(), at_once) for file in files]
+    try:
+        first, second = worker.hold(places[0]), worker.hold(places[1])
+        assert second is not first
+        assert (worker.hold(places[0]) is first) == (at_once == 2)
+        worker.hold(places[2])
+        assert worker.hold(places[1]) is not second, "the one that was not used for longest is forgotten"
+    finally:
+        worker._HELD.clear()
+
+
 def test_another_version_is_refused():
     own = worker.versions()
     with pytest.raises(ClusterError, match="mitsuba .* instead of 9.9.9: install the same"):

@@ -104,7 +104,8 @@ def test_gradients_of_views_add_up(llvm, plugin):
     """One backward pass per view, one update: Mitsuba issues 1587 and 1877 are about losing all but one of them."""
     both = two_views()
     if plugin != "psdr_path":
-        both = replace(both, integrator=integrator_specs.build({"type": plugin, "max_depth": 2, "guiding": "none"}))
+        other = integrator_specs.build({"type": plugin, "max_depth": 2, "guiding": "none"})
+        both = replace(both, parts=(replace(both.parts[0], integrator=other),))
     alone = [gradient_of(OnlyView(both, k)) for k in (0, 1)]
     loss, together = gradient_of(both)
     assert loss == pytest.approx(np.mean([a[0] for a in alone]), rel=1e-4)

@@ -97,7 +97,8 @@ def test_an_earlier_run_is_not_overwritten(llvm, whole):
 def test_what_a_run_leaves(llvm, whole):
     _, out = whole
     names = {path.name for path in out.iterdir()}
-    assert {"log.jsonl", "checkpoint.npz", "result.png", "curves.png", "final.npz", "result.json", "snapshots"} <= names
+    assert {"log.jsonl", "checkpoint.npz", "result.png", "curves.png", "final.npz", "final.xml", "final_files",
+            "result.json", "snapshots"} <= names  # fmt: skip
     row = rows(out)[3]
     assert set(row) == {"iteration", "loss", "gradient_norm", "seconds", "views", "rate", "offset"}
     assert (out / "snapshots" / "000000.exr").is_file()

@@ -1,0 +1,1 @@
+"""Scene files of scenes as they are now: see `write.write_scene`."""
