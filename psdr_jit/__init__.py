@@ -31,6 +31,8 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .derivative.check import CheckResult, check_gradient
     from .derivative.gradient import GradientResult, gradient
     from .derivative.make_plan import make_plan
+    from .inverse.event_files import EventFiles
+    from .inverse.live_view import LiveView
     from .inverse.optimize import optimize
     from .inverse.shapes import Profile, Vertices
     from .inverse.variables import Parameter, Pose
@@ -41,7 +43,9 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
 
     __all__ = [
         "CheckResult",
+        "EventFiles",
         "GradientResult",
+        "LiveView",
         "ParamInfo",
         "Parameter",
         "Plan",

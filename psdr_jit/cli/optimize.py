@@ -34,6 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
     )
+    parser.add_argument("--rerun", metavar="FILE.rrd", help="let the viewer Rerun show images, curves, meshes and "
+                        "cameras: record a new file, or \"live\", to look on (needs the extra 'rerun')")
+    parser.add_argument("--tensorboard", metavar="DIR", help="write curves and images for TensorBoard (needs the extra "
+                        "'tensorboard')")
     common.add_cluster_arguments(parser)
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="print only errors and warnings")
@@ -58,18 +62,28 @@ def run(args: argparse.Namespace) -> int:
         config = configs.with_integrator(config, args.integrator)
     out = args.out or Path("out") / Path(args.config).stem
     loop.require_folder(out, args.resume)  # before targets are rendered
+    observers = observers_of(args)
     problem = configs.problem_of(config)
     start = time.perf_counter()
     with common.cluster(args) as client, progress.bar("optimize", args.quiet) as report:
         if client is not None:
             source = SceneFile(str(config.scene), dict(config.defaults), args.send)
             problem = with_crew(problem, client, source, config.integrator)
-        result = loop.run(problem, out, args.resume, report)
+        result = loop.run(problem, out, args.resume, report, observers)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))
     if result.lost:
         raise StorageError(unsaved(result, out))
     return {loop.DIVERGED: DIVERGED, loop.INTERRUPTED: INTERRUPTED}.get(result.status, OK)
+
+
+def observers_of(args: argparse.Namespace) -> list[Any]:
+    """Who looks at the run, as asked for."""
+    from psdr_jit.inverse.event_files import EventFiles
+    from psdr_jit.inverse.live_view import LiveView
+
+    found = [LiveView(args.rerun)] if args.rerun is not None else []
+    return [*found, EventFiles(args.tensorboard)] if args.tensorboard is not None else found
 
 
 def describe(result: Any, out: Path, seconds: float) -> str:
