@@ -3,6 +3,9 @@
 Log, checkpoints, snapshots and pictures go to a folder (see --out). Ctrl-C ends the current iteration and writes a
 checkpoint (a second one stops at once, without); --resume goes on from it with the same seeds and moments. Exit status:
 0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not be saved, 130 interrupted.
+
+    psdr optimize scenes/inverse/shadow.toml                    # results in out/shadow
+    psdr report out/shadow                                      # a page of them for a browser
 """
 
 from __future__ import annotations
@@ -23,10 +26,11 @@ OK, DIVERGED, INTERRUPTED = 0, 1, 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", metavar="CONFIG.toml", help="what to optimise; scenes/inverse/README.md describes it")
+    parser.add_argument("config", metavar="CONFIG.toml",
+                        help="scene, targets and variables; scenes/inverse/README.md describes the file")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: out/ and the name of the file)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
-    parser.add_argument("--iterations", type=int, metavar="N", help="instead of those in the file")
+    parser.add_argument("--iterations", type=int, metavar="N", help="number of steps, instead of that in the file")
     parser.add_argument(
         "--max-seconds", type=float, metavar="S", help="stop after the iteration in which this time ends"
     )
@@ -34,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
     )
-    parser.add_argument("--rerun", metavar="FILE.rrd", help="let the viewer Rerun show images, curves, meshes and "
-                        "cameras: record a new file, or \"live\", to look on (needs the extra 'rerun')")
+    parser.add_argument("--rerun", metavar="FILE.rrd", help="record images, curves, meshes and cameras for the viewer "
+                        "Rerun; \"live\" instead of a file opens it (needs the extra 'rerun')")
     parser.add_argument("--tensorboard", metavar="DIR", help="write curves and images for TensorBoard (needs the extra "
                         "'tensorboard')")
     common.add_cluster_arguments(parser)
