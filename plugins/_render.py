@@ -78,6 +78,7 @@ class TermIntegrator(ADIntegrator):
         view = find_sensor(scene, sensor)
         if not splits(view):
             return self._forward(self.call(scene, view, seed, spp))
+        self.aovs.require_one_view()
         parts = [self.call(scene, p.sensor, p.seed, p.spp, "forward", p.film) for p in parts_of(view, seed, spp)]
         return side_by_side([self._forward(part) for part in parts])
 
@@ -94,6 +95,7 @@ class TermIntegrator(ADIntegrator):
         if not splits(view):
             self._backward(self.call(scene, view, seed, spp, "backward"), grad_in)
             return
+        self.aovs.require_one_view()
         _require_gradient_image(grad_in, films.black(view.film()).shape)
         parts = parts_of(view, seed, spp)
         for k, p in enumerate(parts):

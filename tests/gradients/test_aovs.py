@@ -85,6 +85,15 @@ def test_radiance_stays_as_it_is(llvm):
 
 
 @pytest.mark.slow
+def test_both_integrators_have_the_same(llvm):
+    """AOVs know nothing of light subpaths."""
+    motion = perturb(scene_of("point_shadow"), BOX, (1, 0, 0))
+    spec = spec_of("dd:depth", sppc=8, sppp=8, sppi=8, form="spatial")
+    a, b = (forward(motion, {**spec, "type": name}, 1, 8)[..., 3] for name in ("psdr_path", "psdr_bdpt"))
+    assert np.abs(a).max() > 1 and np.allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
 def test_a_gradient_has_them_too(llvm):
     """Terms of the public function add up, and its check compares all channels."""
     scene = scene_of("point_shadow", res=16)
