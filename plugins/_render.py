@@ -10,6 +10,7 @@ from psdr_jit.core import film as films
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
+from psdr_jit.driver.aovs import AovChannels, require_no_derivative
 from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import ParameterError, PsdrError
@@ -33,6 +34,7 @@ class TermIntegrator(ADIntegrator):
         super().__init__(props)
         self.memory = Memory()
         self.plan: Plan | None = None  # of the latest derivative
+        self.aovs = AovChannels(self.options)
         self.counters = Counters()
         self.stats = {"rejected": self.counters.rejected, "grazing": self.counters.grazing}  # dropped, or cut short
         self._path = mi.load_dict(
@@ -49,7 +51,8 @@ class TermIntegrator(ADIntegrator):
         view = find_sensor(scene, sensor)
         films.require_samples(view, spp)
         if not splits(view):
-            return self.primal(scene, view, seed, spp, develop, evaluate)
+            return self.aovs.beside(self.primal(scene, view, seed, spp, develop, evaluate), scene, view, seed, spp)
+        self.aovs.require_one_view()
         if not is_uniform(view):
             return self._path.render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
@@ -75,6 +78,7 @@ class TermIntegrator(ADIntegrator):
         view = find_sensor(scene, sensor)
         if not splits(view):
             return self._forward(self.call(scene, view, seed, spp))
+        self.aovs.require_one_view()
         parts = [self.call(scene, p.sensor, p.seed, p.spp, "forward", p.film) for p in parts_of(view, seed, spp)]
         return side_by_side([self._forward(part) for part in parts])
 
@@ -83,7 +87,7 @@ class TermIntegrator(ADIntegrator):
             prepared = self._prepared(call)
             images = {term.name: term.forward(job) for term, job in prepared.jobs}
             prepared.observe(call.seed, images)
-        return sum(images.values(), films.black(call.film))
+            return self.aovs.forward(call, prepared, sum(images.values(), films.black(call.film)))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         require_integrator(self)
@@ -91,6 +95,7 @@ class TermIntegrator(ADIntegrator):
         if not splits(view):
             self._backward(self.call(scene, view, seed, spp, "backward"), grad_in)
             return
+        self.aovs.require_one_view()
         _require_gradient_image(grad_in, films.black(view.film()).shape)
         parts = parts_of(view, seed, spp)
         for k, p in enumerate(parts):
@@ -100,10 +105,18 @@ class TermIntegrator(ADIntegrator):
     def _backward(self, call: Call, grad_in) -> None:
         with alone():
             prepared = self._prepared(call)
-            _require_gradient_image(grad_in, films.black(call.film).shape)
+            _require_gradient_image(grad_in, self.aovs.shape(films.black(call.film)))
+            grad_in = self.aovs.backward(call, prepared, grad_in)
             for term, job in prepared.jobs:
                 term.backward(job, grad_in)
             dr.eval()
+
+    def sample(self, mode, scene, sampler, ray, *args, **kwargs):
+        """Radiance of one ray, for integrators around this one, such as Mitsuba's `aov`; not for derivatives."""
+        require_no_derivative(scene, ray)
+        active = kwargs.get("active", True)
+        value, valid, _ = self._path.sample(scene, sampler, mi.RayDifferential3f(dr.detach(ray)), None, active)
+        return value, valid, [], None
 
     def to_string(self):
         return f"{type(self).__name__}[{self.options}]"

@@ -46,6 +46,10 @@ class PathSpaceIntegrator(TermIntegrator):
        - |string|
        - `lean` leaves out what is certainly 0, `full` computes everything, for comparison; or the text of a plan that
          was made before (`Plan.to_json`), which is then executed as it is (Default: lean)
+     * - aovs
+       - |string|
+       - Further channels of image and derivative, as `dd:depth, nn:sh_normal`: `depth`, `position`, `sh_normal`,
+         `geo_normal`, `shape_index` (Default: none)
      * - direction
        - |string|
        - `known`, in forward mode only, leaves out what has velocity 0 as well (Default: any)

@@ -32,6 +32,8 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
     from .derivative.gradient import GradientResult, gradient
     from .derivative.make_plan import make_plan
     from .export.write import write_scene
+    from .inverse.event_files import EventFiles
+    from .inverse.live_view import LiveView
     from .inverse.optimize import optimize
     from .inverse.parts import Stage
     from .inverse.shapes import Profile, Vertices
@@ -43,7 +45,9 @@ if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is w
 
     __all__ = [
         "CheckResult",
+        "EventFiles",
         "GradientResult",
+        "LiveView",
         "ParamInfo",
         "Parameter",
         "Plan",

@@ -50,6 +50,7 @@ class Options:
     form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
     plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS
+    aovs: str = ""  # further channels of the image, "name:kind, ...", see `paths.aovs`
     more_budgets: tuple[tuple[str, int | None], ...] = ()  # of terms that bring a budget of their own, by name
     light_paths: str = "off"  # one of LIGHT_PATHS; a property of the integrators that can trace them
 

@@ -185,18 +185,25 @@ def _steps(job: Job) -> tuple[PrimaryEdges, Steps] | None:
     Δα = dr.gather(mi.Float, alpha, even) - dr.gather(mi.Float, alpha, even + 1)
     wavelengths = dr.gather(type(wavelengths), wavelengths, even) if mi.is_spectral else wavelengths
     seen = seen_edge(job, edges, sample)
-    sight, view = seen.sight, seen.view
-    scale = seen.across / (view.J_px * sample.pdf)
+    scale = per_motion(seen, sample)
     if job.learns:
         edges.rows.learn(edges.state, sample.row, sample.t, lambda: dr.max(dr.abs(ΔL)) * scale)
+    return edges, steps_at(job, edges, seen, sample, (ΔL * scale, Δα * scale, wavelengths))
+
+
+def per_motion(seen: SeenEdge, sample: EdgeSample) -> mi.Float:
+    """What a step of 1 at the edge brings, per unit of its motion."""
+    return seen.across / (seen.view.J_px * sample.pdf)
+
+
+def steps_at(job: Job, edges: PrimaryEdges, seen: SeenEdge, sample: EdgeSample, values: tuple) -> Steps:
+    """Samples ready to be moved; `values`: (contribution, coverage, wavelengths)."""
+    sight, view = seen.sight, seen.view
     turn = edges.table.turn(sight.at, view.ω, sight.n_perp) if job.facts.camera_moves else mi.Vector3f(0)
-    return edges, Steps(
-        sight.at, view.ω, sight.n_perp, turn, view.p, view.film, sample.aperture,
-        ΔL * scale, Δα * scale, wavelengths, seen.valid,
-    )  # fmt: skip
+    return Steps(sight.at, view.ω, sight.n_perp, turn, view.p, view.film, sample.aperture, *values, seen.valid)
 
 
-def _motion(job: Job, edges: PrimaryEdges, steps: Steps, moving: Displacements) -> mi.Float:
+def motion_across(job: Job, edges: PrimaryEdges, steps: Steps, moving: Displacements) -> mi.Float:
     """How fast the edges move across the film, attached; value 0."""
     relative = moving.of_edge(edges.table, steps.at, steps.ω)
     if not job.facts.camera_moves:
@@ -219,7 +226,7 @@ def forward(job: Job) -> mi.TensorXf:
             return films.black(job.film)
         edges, steps = found
         with job.motion.attached() as moving:
-            motion = tangents(_motion(job, edges, steps, moving))
+            motion = tangents(motion_across(job, edges, steps, moving))
         return _splat(job, steps, motion)
 
 
@@ -234,7 +241,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
         # Stored: each entry of a pose is a sum over all samples, in a kernel that would compute all this anew.
         dr.eval(λ, steps)
         with job.motion.attached() as moving:
-            accumulate(λ * _motion(job, edges, steps, moving))
+            accumulate(λ * motion_across(job, edges, steps, moving))
 
 
 def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:

@@ -2,6 +2,12 @@
 
 Writes a multi-layer OpenEXR file (primal, total, each term, their standard errors) and a PNG beside it.
 With --check the derivative is compared with finite differences; the exit status is then 1 unless it passes.
+
+    psdr params scenes/cbox.xml                                                    # names for --wrt
+    psdr gradient scenes/cbox.xml --wrt small-box.vertex_positions --direction 1,0,0          # the box moves along x
+    psdr gradient scenes/cbox.xml --wrt light.to_world --rotate 0,1,0 --check                 # the light turns about y
+
+A parameter of several numbers, such as positions or a pose, needs one of --direction, --rotate and --index.
 """
 
 from __future__ import annotations
@@ -22,18 +28,21 @@ OK, CHECK_FAILED = 0, 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_scene_arguments(parser)
-    parser.add_argument("--wrt", required=True, metavar="PARAM", help="parameter; 'psdr params' lists them")
+    parser.add_argument("--wrt", required=True, metavar="PARAM",
+                        help="the parameter that changes; 'psdr params SCENE.xml' lists them")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--direction", type=common.vector, metavar="x,y,z",
-                     help="translation in world space, or one number per colour channel")
+                     help="how it changes: a shift in world space, or one number per colour channel")
     way.add_argument("--rotate", type=common.vector, metavar="x,y,z",
-                     help="world axis through the shape's centre; the derivative is per radian")
-    way.add_argument("--index", type=int, metavar="I", help="one scalar of the parameter")
+                     help="it turns: about this world axis through its centre; the derivative is per radian")
+    way.add_argument("--index", type=int, metavar="I", help="only this one of its numbers changes, counted from 0")
     # argparse takes -1,0,0 for an option unless told that it is a number
     parser._negative_number_matcher = re.compile(r"^-[\d.][\d.,eE+-]*$")
     parser.add_argument("--spp", type=int, default=64, help="samples per pixel, seed and term (default: 64)")
-    parser.add_argument("--seeds", type=int, default=8, help="independent images to average (default: 8)")
-    parser.add_argument("--max-depth", type=int, metavar="N", help="path length (default: the scene's own)")
+    parser.add_argument("--seeds", type=int, default=8,
+                        help="independent images that are averaged; standard errors are their scatter (default: 8)")
+    parser.add_argument("--max-depth", type=int, metavar="N",
+                        help="longest path in segments; 2 is direct light (default: the scene's own)")
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
     parser.add_argument("-o", "--output", metavar="FILE",
                         help=".exr file (default: the scene's name with _gradient.exr, in this folder)")

@@ -4,6 +4,9 @@ Log, checkpoints, snapshots, pictures and the scene that was found, final.xml, g
 the current iteration and writes a checkpoint (a second one stops at once, without); --resume goes on from it with the
 same seeds and moments. Exit status: 0 done or out of time, 1 the run diverged, 2 wrong input, 3 final values could not
 be saved, 130 interrupted.
+
+    psdr optimize scenes/inverse/shadow.toml                    # results in out/shadow
+    psdr report out/shadow                                      # a page of them for a browser
 """
 
 from __future__ import annotations
@@ -24,10 +27,11 @@ OK, DIVERGED, INTERRUPTED = 0, 1, 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", metavar="CONFIG.toml", help="what to optimise; scenes/inverse/README.md describes it")
+    parser.add_argument("config", metavar="CONFIG.toml",
+                        help="scene, targets and variables; scenes/inverse/README.md describes the file")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default: out/ and the name of the file)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
-    parser.add_argument("--iterations", type=int, metavar="N", help="instead of those in the file")
+    parser.add_argument("--iterations", type=int, metavar="N", help="number of steps, instead of that in the file")
     parser.add_argument(
         "--max-seconds", type=float, metavar="S", help="stop after the iteration in which this time ends"
     )
@@ -35,6 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--integrator", metavar="PLUGIN", help="another integrator, for comparison, such as prb_projective"
     )
+    parser.add_argument("--rerun", metavar="FILE.rrd", help="record images, curves, meshes and cameras for the viewer "
+                        "Rerun; \"live\" instead of a file opens it (needs the extra 'rerun')")
+    parser.add_argument("--tensorboard", metavar="DIR", help="write curves and images for TensorBoard (needs the extra "
+                        "'tensorboard')")
     common.add_cluster_arguments(parser)
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="print only errors and warnings")
@@ -58,17 +66,27 @@ def run(args: argparse.Namespace) -> int:
         config = configs.with_integrator(config, args.integrator)
     out = args.out or Path("out") / Path(args.config).stem
     loop.require_folder(out, args.resume)  # before targets are rendered
+    observers = observers_of(args)
     problem = configs.problem_of(config, args.send)
     start = time.perf_counter()
     with common.cluster(args) as client, progress.bar("optimize", args.quiet) as report:
         if client is not None:
             problem = with_crew(problem, client, config.integrator)
-        result = loop.run(problem, out, args.resume, report)
+        result = loop.run(problem, out, args.resume, report, observers)
     if not args.quiet:
         print(describe(result, out, time.perf_counter() - start))
     if result.lost:
         raise StorageError(unsaved(result, out))
     return {loop.DIVERGED: DIVERGED, loop.INTERRUPTED: INTERRUPTED}.get(result.status, OK)
+
+
+def observers_of(args: argparse.Namespace) -> list[Any]:
+    """Who looks at the run, as asked for."""
+    from psdr_jit.inverse.event_files import EventFiles
+    from psdr_jit.inverse.live_view import LiveView
+
+    found = [LiveView(args.rerun)] if args.rerun is not None else []
+    return [*found, EventFiles(args.tensorboard)] if args.tensorboard is not None else found
 
 
 def describe(result: Any, out: Path, seconds: float) -> str:

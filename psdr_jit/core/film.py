@@ -136,6 +136,34 @@ def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> m
     return image / _pixel_mass(film)
 
 
+def develop_channels(film: mi.Film, names: list[str], at: FilmPoints, values: list[mi.Float]) -> mi.TensorXf:
+    """`develop_samples` of other channels than radiance: (H, W, K), attached where `values` are."""
+    return _channels(film, names, at.p, (values, at.weight), (at.weight, mi.Bool(True), at.coalesce))
+
+
+def develop_boundary_channels(film: mi.Film, names: list[str], pos, values: list[mi.Float], active) -> mi.TensorXf:
+    """`develop_boundary` of other channels than radiance: (H, W, K), attached where `values` are."""
+    lower, upper = sampled_window(film)
+    inside = (pos.x >= lower[0]) & (pos.x < upper[0]) & (pos.y >= lower[1]) & (pos.y < upper[1])
+    image = _channels(film, names, pos, (values, mi.Float(1)), (mi.Float(0), active & inside, False))
+    return image if film.rfilter().is_box_filter() else image / _pixel_mass(film)
+
+
+def _channels(film: mi.Film, names: list[str], pos, weighted, how) -> mi.TensorXf:
+    """The last channels of a film that has been prepared for `names` as well; it is then as before."""
+    (values, factor), (weight, active, coalesce) = weighted, how
+    film.prepare(names)
+    block = film.create_block()
+    block.set_coalesce(block.coalesce() and coalesce)
+    zero = mi.Float(0)
+    base = [zero] * (4 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 3)
+    block.put(pos, [*base, weight, *(value * factor for value in values)], active)
+    film.put_block(block)
+    image = film.develop()
+    clear(film)
+    return image[:, :, image.shape[2] - len(names) : image.shape[2]]
+
+
 def develop_splats(film: mi.Film, pos: mi.Point2f, value: mi.Spectrum, wavelengths, active: mi.Bool) -> mi.TensorXf:
     """Image of light that lands on the film at `pos` [px], in the window of camera samples or not.
 

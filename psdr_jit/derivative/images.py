@@ -84,7 +84,7 @@ def _require_whole(path: str, channels: Mapping[str, np.ndarray]) -> None:
 def _channels(prefix: str, image: np.ndarray) -> dict[str, np.ndarray]:
     image = np.asarray(image, dtype=np.float32)
     image = image if image.ndim == 3 else image[..., None]
-    names = CHANNELS.get(image.shape[-1], tuple(f"C{k}" for k in range(image.shape[-1])))
+    names = CHANNELS.get(image.shape[-1], ("R", "G", "B", *(f"C{k}" for k in range(3, image.shape[-1]))))
     return {prefix + c: np.ascontiguousarray(image[..., k]) for k, c in enumerate(names)}
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
 from psdr_jit.options import FOLLOWS
+from psdr_jit.paths.aovs import Aovs
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.facts import analyse
 
@@ -111,7 +112,11 @@ def reference(spec: Mapping[str, Any], scene: Any) -> Any:
     """What finite differences are taken of: Mitsuba's `path` with the path options of `spec`.
 
     Where `psdr_bdpt` shows what `path` does not, light of points by way of mirrors and smooth glass: `psdr_bdpt`.
+    With `aovs`, Mitsuba's `aov` around it.
     """
+    if spec.get("aovs"):
+        inner = {key: value for key, value in spec.items() if key != "aovs"}
+        return build({"type": "aov", "aovs": Aovs.parse(spec["aovs"]).text, "image": reference(inner, scene)})
     options = {k: spec[k] for k in PATH_OPTIONS if k in spec}
     if spec.get("type") == "psdr_bdpt" and spec.get("light_paths") != "off":
         facts = analyse(scene)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -54,6 +54,7 @@ class Prepared:
     plan: Plan
     jobs: list[tuple[Term, Job]]
     log: NoiseLog | None  # wants to see the derivative images of forward mode
+    plain: Callable[[int], Job]  # the job of what is no term: so many paths per pixel, spread evenly
 
     def observe(self, seed: object, images: Mapping[str, mi.TensorXf]) -> None:
         """Hand over the images of all terms."""
@@ -101,7 +102,8 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t)) for t in plan.running], log)
+    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t)) for t in plan.running], log,
+                    lambda spp: question.job(plan, spp))  # fmt: skip
 
 
 def _spread(plan: Plan, measured: Measurement) -> Plan:

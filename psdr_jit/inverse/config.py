@@ -102,7 +102,8 @@ def read(path: str | Path, **changes: Any) -> Config:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"'{path}' is not valid TOML: {error}") from error
+        scene = "; a scene is named in such a file, see scenes/inverse/README.md" if path.suffix == ".xml" else ""
+        raise OptionError(f"'{path}' is not valid TOML: {error}{scene}") from error
     wrong: list[str] = []
     config = _checked(path, {**content, **changes}, wrong)
     if wrong:

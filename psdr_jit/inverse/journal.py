@@ -13,7 +13,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from psdr_jit.export import assets
 from psdr_jit.export.write import write_scene
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import pictures
+from psdr_jit.inverse.observer import Observer, Seen
 from psdr_jit.inverse.variables import numbers
 from psdr_jit.scene.params import is_transform
 
@@ -43,10 +44,14 @@ SEED = 0x57121B  # of the strip's images
 
 
 class Journal:
-    """Writes into `folder`, or nothing if it is None. `keep`: iterations of an earlier run that stay in the log."""
+    """Writes into `folder`, or nothing if it is None. `keep`: iterations of an earlier run that stay in the log.
 
-    def __init__(self, folder: Path | None, problem: Any, keep: int) -> None:
+    `observers` see each iteration as well, with a folder or without.
+    """
+
+    def __init__(self, folder: Path | None, problem: Any, keep: int, observers: Sequence[Observer] = ()) -> None:
         self.folder = folder
+        self._observers = observers
         self.not_written: list[str] = []
         self.lost: dict[str, str] = {}  # files with final values that are missing, and why
         self._rows: list[dict[str, Any]] = []
@@ -66,8 +71,15 @@ class Journal:
         except OSError as error:
             raise files.refusal(folder, error) from error
 
-    def close(self) -> None:
-        """Close the log; one that has nothing in it is removed."""
+    def begin(self, problem: Any) -> None:
+        """Let observers look at the problem."""
+        for observer in self._observers:
+            observer.begin(problem)
+
+    def close(self, iteration: int = 0) -> None:
+        """Close the log; one that has nothing in it is removed. Observers take a last look."""
+        for observer in self._observers:
+            observer.close(iteration)
         if self._log is None:
             return
         self._try("log.jsonl", self._log.close)
@@ -75,17 +87,22 @@ class Journal:
         if log.is_file() and log.stat().st_size == 0:
             log.unlink()
 
-    def step(self, iteration: int, loss: float, norms: dict[str, float], seconds: float, views: list[int], rate: float,
-             offsets: dict[str, dict[str, float]]) -> None:  # fmt: skip
+    def show(self, seen: Seen) -> None:
+        """Let observers look at an iteration, while the scene stands where it was in it."""
+        for observer in self._observers:
+            observer.step(seen)
+
+    def step(self, seen: Seen, seconds: float, problem: Any) -> None:
         """Log an iteration: what was found before its step."""
+        loss, norms = seen.loss, seen.norms
         row = {
-            "iteration": iteration,
+            "iteration": seen.iteration,
             "loss": loss if np.isfinite(loss) else None,
             "gradient_norm": {name: norm if np.isfinite(norm) else None for name, norm in norms.items()},
             "seconds": seconds,
-            "views": views,
-            "rate": rate,
-            "offset": offsets,
+            "views": problem.chosen(seen.iteration),
+            "rate": seen.rate,
+            "offset": seen.offsets,
         }
         self._rows.append(row)
 
@@ -94,6 +111,9 @@ class Journal:
             self._log.flush()
 
         self._try("log.jsonl", write)
+        every = problem.settings.snapshot_every
+        if every and seen.iteration % every == 0:
+            self.snapshot(seen.iteration, problem, seen.images)
 
     def keep(self, checkpoint: checkpoints.Checkpoint, last: bool = False) -> None:
         """Replace the checkpoint; the `last` one holds what the run has found."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
 from psdr_jit.inverse.interruption import interruptible
 from psdr_jit.inverse.journal import Journal
+from psdr_jit.inverse.observer import Observer, Seen
 from psdr_jit.inverse.problem import Latents, Problem, copied
 from psdr_jit.inverse.variables import like, numbers
 
@@ -76,24 +77,26 @@ def run(
     folder: Path | None = None,
     resume: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
+    observers: Sequence[Observer] = (),
 ) -> Result:
     """Optimise; with a `folder`, log there, checkpoint, and `resume` from it. See `psdr_jit.optimize`."""
     require_folder(folder, resume)
     if folder is None:
-        return _run(problem, None, False, progress)
+        return _run(problem, None, False, progress, observers)
     with lock.held(folder):
         require_folder(folder, resume, mine=True)  # a run may have ended here in between
-        return _run(problem, folder, resume, progress)
+        return _run(problem, folder, resume, progress, observers)
 
 
-def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> Result:
+def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any, observers: Sequence[Observer]) -> Result:
     state = begin(problem)
     if resume:
         _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
-    journal = Journal(folder, problem, keep=state.iteration)
+    journal = Journal(folder, problem, keep=state.iteration, observers=observers)
     losses: list[float] = []
     try:
         journal.picture(problem, problem.start())
+        journal.begin(problem)
         with warnings.catch_warnings():
             # said once it has lasted, with the variable's name; entered once, or "once" would mean every iteration
             warnings.simplefilter("ignore", ZeroDerivativeWarning)
@@ -111,7 +114,7 @@ def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any) -> 
         journal.keep(_checkpoint(problem, state))
         raise
     finally:
-        journal.close()
+        journal.close(state.iteration)
     result.not_written, result.lost, result.folder = journal.not_written, journal.lost, folder
     return result
 
@@ -255,19 +258,17 @@ def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
     state.norms = {}
     for name, variable in problem.variables.items():
         _step(problem, state, name, variable, rate)
+    seen = Seen(state.iteration, loss, rate, state.norms, problem.offsets(before), before, images)
+    journal.show(seen)
     problem.apply(state.latents)
-    journal.step(state.iteration, loss, state.norms, time.perf_counter() - start, problem.chosen(state.iteration), rate,
-                 problem.offsets(before))  # fmt: skip
-    every = problem.settings.snapshot_every
-    if every and state.iteration % every == 0:
-        journal.snapshot(state.iteration, problem, images)
+    journal.step(seen, time.perf_counter() - start, problem)
     return loss
 
 
 def _step(problem: Problem, state: _State, name: str, variable: Any, rate: float) -> None:
     """Move one variable, unless its gradient is not finite."""
     opt, latents = state.optimisers[name], state.latents[name]
-    norms = {latent: _norm(dr.grad(opt[latent])) for latent in latents}
+    norms = {latent: float(np.linalg.norm(numbers(dr.grad(opt[latent])))) for latent in latents}
     for latent, norm in norms.items():
         label = f"{name} ({latent})"
         state.norms[label] = norm
@@ -278,10 +279,6 @@ def _step(problem: Problem, state: _State, name: str, variable: Any, rate: float
     for latent, value in variable.constrained({k: dr.detach(opt[k]) for k in latents}).items():
         opt[latent] = value
         latents[latent] = opt[latent]
-
-
-def _norm(grad: Any) -> float:
-    return float(np.sqrt(np.sum(np.square(numbers(grad)))))
 
 
 def _watch(problem: Problem, state: _State, label: str, norm: float) -> None:

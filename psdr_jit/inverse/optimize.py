@@ -14,6 +14,7 @@ from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.errors import OptionError
 from psdr_jit.inverse import loop
+from psdr_jit.inverse.observer import Observer
 from psdr_jit.inverse.parts import Stage
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.remote import with_crew
@@ -34,6 +35,7 @@ def optimize(
     progress: Callable[[int, int, str], None] | bool | None = None,
     client: Any = None,
     source: SceneFile | str | None = None,
+    observers: Sequence[Observer] = (),
     **settings: Any,
 ) -> loop.Result:
     """Change `variables` of `scene` until its sensors see `targets`; the scene is left at what was found.
@@ -55,6 +57,7 @@ def optimize(
     `progress(done, total, note)` is called after every iteration; True shows a bar, None does so in notebooks.
     `client`: a `distributed.Client`, whose workers then render, view by view; `source`: the file that the scene was
     loaded from, with the defaults. What a worker has begun is done by another one if it dies.
+    `observers`: who looks at each iteration, such as `psdr_jit.LiveView("run.rrd")`; see `inverse.observer`.
 
     Raises `ParameterError`, `OptionError`, `SceneError` or `UnsupportedError` before the first iteration. Warns
     (`StalledWarning`) where the loss does not depend on a variable, and of a loss that diverges; the run then ends and
@@ -71,4 +74,4 @@ def optimize(
     if client is not None:
         problem = with_crew(problem, client, integrator)
     with reporting("optimize", progress) as report:
-        return loop.run(problem, None if out is None else Path(out), resume, report)
+        return loop.run(problem, None if out is None else Path(out), resume, report, observers)

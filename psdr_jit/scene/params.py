@@ -121,6 +121,10 @@ def parameter_value(params: Any, name: str) -> Any:
 
 def _suggestion(name: str, known: list[str]) -> str:
     last = name.rsplit(".", 1)[-1]
+    own = [k for k in known if k.startswith(f"{name}.")]
+    if own:  # an object was named, most likely to be moved
+        own.sort(key=lambda k: not k.endswith(("positions", "to_world")))
+        return "; of that object there are " + ", ".join(f"'{k}'" for k in own)
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     close += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in close]
     if not close:

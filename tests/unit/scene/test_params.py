@@ -75,6 +75,8 @@ def test_unknown_parameter_suggests_close_names(scene):
         find_param(scene, "box.vertex_position")
     with pytest.raises(ParameterError, match=r"panel\.emitter\.radiance\.value"):
         find_param(scene, "radiance.value")
+    with pytest.raises(ParameterError, match=r"of that object there are 'box\.vertex_positions'"):
+        find_param(scene, "box")
 
 
 CURVES = [

@@ -1,0 +1,42 @@
+"""What changes of AOVs along fixed viewing rays: Mitsuba's own derivative of what a ray meets, ∫ f ∂A/∂θ dx."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.ad import backpropagate, tangents
+from ..paths.aovs import Aovs
+from ..plan.job import Job
+from .term import camera_passes
+
+
+def _images(job: Job, aovs: Aovs) -> Iterator[mi.TensorXf]:
+    """Images (H, W, K) of passes, attached to the scene's parameters; their sum is the image."""
+    for p in camera_passes(job):
+        with dr.resume_grad():
+            si = job.scene.ray_intersect(p.ray, mi.RayFlags.All, coherent=True)
+            values = [value * p.share for value in aovs.values(si, p.ray.o)]
+            yield films.develop_channels(job.film, aovs.channels, p.at, values)
+
+
+def forward(job: Job, aovs: Aovs) -> mi.TensorXf:
+    """Derivative image (H, W, K) along the tangents set on the scene's parameters. Detached."""
+    total = 0.0
+    with dr.suspend_grad():
+        for image in _images(job, aovs):
+            with dr.resume_grad():
+                total = total + dr.detach(tangents(image))
+    return total
+
+
+def backward(job: Job, aovs: Aovs, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters; `grad_in` is (H, W, K)."""
+    with dr.suspend_grad():
+        for image in _images(job, aovs):
+            with dr.resume_grad():
+                if dr.grad_enabled(image):
+                    backpropagate(image, grad_in)

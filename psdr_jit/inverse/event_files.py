@@ -1,0 +1,64 @@
+"""Curves and images of an optimisation for TensorBoard, by the package `tensorboardX`, which needs no TensorFlow.
+
+Tags: those of `observer.curves`, and `VIEW/image`, `VIEW/target`.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psdr_jit.core import files
+from psdr_jit.derivative.images import srgb
+from psdr_jit.errors import OptionError, SetupError
+from psdr_jit.inverse.observer import Care, Seen, curves, frame_due
+
+
+class EventFiles:
+    """An observer that adds an event file to `folder`. Raises `SetupError` where the package is missing."""
+
+    def __init__(self, folder: str | os.PathLike) -> None:
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise SetupError(
+                f"files for TensorBoard need the package tensorboardX ('{error.name}' is missing): pip install "
+                "'mitsuba-psdr[tensorboard]'"
+            ) from error
+        folder = Path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise OptionError(f"--tensorboard {folder}: that is a file; name a folder")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._writer = SummaryWriter(str(folder))
+        except OSError as error:
+            raise files.refusal(folder, error) from error
+        self._care = Care(f"'{folder}'")
+        self._problem: Any = None
+
+    def begin(self, problem: Any) -> None:
+        self._problem = problem
+        for view in problem.views:
+            self._care.attempt(lambda view=view: self._image(f"{view.name}/target", np.array(view.target), 0))
+
+    def step(self, seen: Seen) -> None:
+        self._care.attempt(lambda: self._step(seen))
+
+    def close(self, iteration: int) -> None:
+        self._care.attempt(self._writer.close)
+
+    def _step(self, seen: Seen) -> None:
+        for name, values in curves(seen).items():
+            for k, value in enumerate(values):
+                tag = name if len(values) == 1 else f"{name}/{k}"
+                self._writer.add_scalar(tag, value, seen.iteration)
+        if frame_due(seen.iteration, self._problem.settings.iterations):
+            for k, image in seen.images.items():
+                self._image(f"{self._problem.views[k].name}/image", image, seen.iteration)
+
+    def _image(self, tag: str, image: np.ndarray, iteration: int) -> None:
+        shown = np.round(255 * srgb(image)).astype(np.uint8)
+        self._writer.add_image(tag, shown, iteration, dataformats="HWC")
