@@ -18,7 +18,8 @@ Behind the first vertex any segment may step: what a mirror shows, the shadow on
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
 outlines, creases, curves along which surfaces cut, shading outlines and patterns. Left out is what lies behind more
-than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along.
+than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along. With light subpaths, what points send
+to the film by way of mirrors and glass steps as well, and is searched from the light's side (`light_chain`).
 """
 
 from __future__ import annotations
