@@ -271,6 +271,7 @@ TERM = Term(
              Stream.LIGHT_CHAIN),
     needed=needed,
     cost=cost,
+    with_light=2.0,  # 3 beside a ball of glass, seen directly
     forward=forward,
     backward=backward,
     over_film=True,
