@@ -32,7 +32,7 @@ from ..core.sensor_frame import SensorFrame, View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.upload import uploaded
 from ..core.varying import varying
-from ..paths.light_source import LightSources, cone
+from ..paths.light_source import LightSources, cone, place_of
 from ..paths.light_technique import LightTechnique
 from ..paths.rays import skip_emitters
 from ..paths.sensor_connection import on_film
@@ -173,8 +173,7 @@ class LightLines:
         targets = len(self._targets)
         target = square % targets
         emitter = dr.gather(mi.UInt32, self.points, square // targets)
-        of_light, _ = dr.reinterpret_array(mi.EmitterPtr, emitter).sample_ray(0, 0, mi.Point2f(0.5), mi.Point2f(0.5))
-        y = mi.Point3f(dr.detach(of_light.o))
+        y = place_of(dr.reinterpret_array(mi.EmitterPtr, emitter), mi.Bool(True))
         axis, inverse_angle = mi.Vector3f(0, 0, 1), mi.Float(1)
         for i, ball in enumerate(self._targets):
             this, _, inverse = cone(ball, y)

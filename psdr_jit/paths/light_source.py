@@ -59,9 +59,8 @@ class LightSources:
 
         shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, chosen))
         on = shape.sample_position(0, u, ~delta)
-        of_delta, _ = emitter.sample_ray(0, 0, mi.Point2f(0.5), mi.Point2f(0.5), delta)
         si = mi.SurfaceInteraction3f(on, wavelengths)
-        si.p = dr.select(delta, of_delta.o, si.p)
+        si.p = dr.select(delta, place_of(emitter, delta), si.p)
         si.n = dr.select(delta, 0, si.n)
         si.wavelengths = wavelengths
         ω = self._aim(si.p, u_target, v)
@@ -105,6 +104,12 @@ class LightSources:
         measure = dr.select(dr.all(n == 0), dr.rcp(dr.square(r)), dr.rcp(dr.abs_dot(n, ω)))
         E = light * self._aimed_pdf(y, ω) * measure
         return dr.select(known & (light > 0) & dr.isfinite(E), E, 0)
+
+
+def place_of(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Point3f:
+    """Where point and spot lights are. Not by `sample_ray`, which textures on other lights may not know. Detached."""
+    ds, _ = emitter.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), active)
+    return mi.Point3f(dr.detach(ds.p))
 
 
 def cone(ball: tuple[mi.Point3f, mi.Float], y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
