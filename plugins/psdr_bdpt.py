@@ -26,7 +26,7 @@ class BidirectionalIntegrator(TermIntegrator):
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small
     sources send through glass, or by way of mirrors, has less noise. Each camera sample comes with two light subpaths.
     Light of points and spots through smooth glass and by way of smooth mirrors, which camera paths never find, is in
-    the image as well; its derivative needs a smooth reconstruction filter, and has no boundary terms.
+    the image as well; its derivative needs a smooth reconstruction filter. Its steps belong to the budget `spps`.
     """
 
     bidirectional = True

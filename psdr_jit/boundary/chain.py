@@ -18,12 +18,13 @@ Behind the first vertex any segment may step: what a mirror shows, the shadow on
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
 outlines, creases, curves along which surfaces cut, shading outlines and patterns. Left out is what lies behind more
-than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along.
+than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along. With light subpaths, what points send
+to the film by way of mirrors and glass steps as well, and is searched from the light's side (`light_chain`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -36,17 +37,17 @@ from ..core.streams import Stream, stream_seed
 from ..options import Options
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
-from ..plan.motion import Displacements, Motion
+from ..plan.motion import Displacements
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
+from . import light_chain
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
-from .chain_outline import AnalyticShapes, Curve, crossed_curve
-from .chain_patterns import INSET
+from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
 from .chain_search import find_crossings
-from .chain_sweeps import AtRest, carry_adjoints, carry_tangents
+from .chain_sweeps import AtRest, carry_adjoints, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
 NAME = "chain"
@@ -120,23 +121,6 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     return job.call.counters.rejected.keep_finite(step)
 
 
-def _beside_line(job: Job, pair: Pair, curve: Curve) -> Pair:
-    """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
-    ray = mi.Ray3f(pair.a.o, pair.a.d)
-    si = pair.a.intersection().compute_surface_interaction(ray, mi.RayFlags.All, curve.pattern)
-    across = curve.g * (INSET / dr.squared_norm(curve.g))
-    step = si.dp_du * across.x + si.dp_dv * across.y
-    crossed = curve.pattern & dr.all(dr.isfinite(step))
-
-    def moved(hit: Hit, side: mi.Float) -> Hit:
-        # From half of the way: beside its start there may be the surface that it has left.
-        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + side * step, hit.d)
-        there = Hit.of(ray, job.scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
-        return dr.select(crossed & (there.shape == hit.shape), there, hit)
-
-    return replace(pair, a=moved(pair.a, curve.side), b=moved(pair.b, -curve.side))
-
-
 def _light_step(job: Job, pair: Pair, chain: ChainRecords, wavelengths) -> tuple[mi.Spectrum, Hit, mi.Float]:
     """Of shadow rays: `(L_a − L_b times the path's throughput, the one that is not blocked, its length)`."""
     hit = chain.segment(pair.k, pair.in_light)
@@ -165,7 +149,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
     if lines.world.patterns is not None:
-        pair = _beside_line(job, pair, curve)
+        pair = beside_line(job.scene, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
     end = End(pair.last, curve, pair.in_light, pair.light, source, distance)
 
@@ -192,17 +176,7 @@ def _film_slope(lines: Lines, chain: ChainRecords, end: End, at: tuple) -> mi.Fl
         first = chain.segment(mi.UInt32(0), mi.Bool(True))
         start = ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d))
         o_grad, d_grad = tangents(start, ray.d)
-    return _slope(lines.job, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
-
-
-def _slope(job: Job, chain: ChainRecords, end: End, camera: tuple, motion: Motion) -> mi.Float:
-    """Tangent of F at the `end` of chains, given the tangents `camera` of their first rays."""
-    o_grad, d_grad = carry_tangents(chain, end.segment, *camera, motion)
-    o, d = mi.Point3f(end.curve.line.o), mi.Vector3f(end.curve.line.d)
-    with motion.attached(o, d) as moving:
-        dr.set_grad(o, o_grad)
-        dr.set_grad(d, d_grad)
-        return tangents(end.attached_F(o, d, moving, job.facts))
+    return slope_at_end(lines.job.facts, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
 
 
 def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -225,8 +199,10 @@ def forward(job: Job) -> mi.TensorXf:
             if job.facts.camera_moves:
                 with job.motion.attached() as moving:
                     camera = tangents(*_camera(moving, steps, chain))
-            F_grad = _slope(part, chain, steps.end, camera, job.motion)
+            F_grad = slope_at_end(job.facts, chain, steps.end, camera, job.motion)
             image += share * _splat(job, steps, job.call.counters.rejected.keep_finite(steps.value * F_grad))
+        if job.light is not None:
+            image += light_chain.forward(job)
     return image
 
 
@@ -257,6 +233,8 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                     start, direction = _camera(moving, steps, chain)
                     accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))
             dr.eval()
+        if job.light is not None:
+            light_chain.backward(job, grad_in)
 
 
 def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:
@@ -289,9 +267,11 @@ def cost(form: str, sky: bool) -> float:
 TERM = Term(
     name=NAME,
     budget="spps",
-    streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_GUIDE, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE),
+    streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_GUIDE, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE,
+             Stream.LIGHT_CHAIN),
     needed=needed,
     cost=cost,
+    with_light=2.0,  # 3 beside a ball of glass, seen directly
     forward=forward,
     backward=backward,
     over_film=True,

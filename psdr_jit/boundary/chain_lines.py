@@ -20,6 +20,9 @@ from ..plan.job import Job
 from .chain_fixed import Directions
 from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
 
+#: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
+NARROWEST = 2.0**-10
+
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
 LEAST_WIDTH, ROUNDING = 2.0**-14, 5e-7
 
@@ -46,6 +49,8 @@ class Lines:
     world: ChainWorld
     samples: FilmSamples
     directions: Directions  # of their smooth vertices
+    narrowest = NARROWEST
+    first_kept = 1  # segment: what camera rays meet first is the primary boundary's
 
     @staticmethod
     def of(job: Job) -> Lines:

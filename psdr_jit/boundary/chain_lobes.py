@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..paths.bounce import particle_correction
 from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
 from .chain_fixed import EVEN, Direction
 
@@ -44,13 +45,17 @@ def smooth_choice(bsdf: mi.BSDFPtr, k: mi.UInt32, u: mi.Float) -> tuple[mi.Bool,
     return chosen, dr.select(smooth & delta, share, 1)
 
 
-def leave(si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool) -> Leaving:
-    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses."""
+def leave(
+    si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool, ctx: mi.BSDFContext
+) -> Leaving:
+    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses. `ctx` tells what is carried."""
     bsdf = si.bsdf()
     smooth, share = smooth_choice(bsdf, k, u.x)
     smooth &= active
-    onward = _delta_leave(si, bsdf, (u.y, fixed.reflected), active & ~smooth)
-    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(fixed.ω), smooth)
+    onward = _delta_leave(si, ctx, (u.y, fixed.reflected), active & ~smooth)
+    f = bsdf.eval(ctx, si, si.to_local(fixed.ω), smooth)
+    if ctx.mode == mi.TransportMode.Importance:
+        f *= particle_correction(si, fixed.ω)
     ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
     factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
     return Leaving(ray, factor, (smooth & dr.any(factor != 0)) | onward.alive, onward.alive)
@@ -63,21 +68,21 @@ def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
     return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection), passes
 
 
-def _delta_leave(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, choice: tuple, active: mi.Bool) -> Leaving:
+def _delta_leave(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, choice: tuple, active: mi.Bool) -> Leaving:
     """By the reflected lobe or the one that leads through; `choice`: (random number, share of the reflected one)."""
     u, share = choice
-    reflects, passes = _delta_kinds(bsdf)
+    reflects, passes = _delta_kinds(si.bsdf())
     through = passes & (~reflects | (u >= share))
     probability = dr.select(reflects & passes, dr.select(through, 1 - share, share), 1)
-    value, bs = _lobe(si, bsdf, through, active & (reflects | passes))
+    value, bs = _lobe(si, ctx, through, active & (reflects | passes))
     alive = dr.any(value != 0)
     return Leaving(si.spawn_ray(si.to_world(bs.wo)), dr.select(alive, value / probability, 0), alive, alive)
 
 
-def _lobe(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, through: mi.Bool, active: mi.Bool):
+def _lobe(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, through: mi.Bool, active: mi.Bool):
     """`(value, sample)` of the delta lobe that leads through the surface, or of the other one; 0 if it has none."""
-    number = dr.select(through, mi.Float(LAST_LOBE), FIRST_LOBE)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, number, mi.Point2f(0.5), active)
+    bsdf, number = si.bsdf(), dr.select(through, mi.Float(LAST_LOBE), FIRST_LOBE)
+    bs, weight = bsdf.sample(ctx, si, number, mi.Point2f(0.5), active)
     crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) < 0
     there = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0) & (crosses == through)
     null = there & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -87,11 +92,11 @@ def _lobe(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, through: mi.Bool, activ
 
 def reflected_share(of: tuple, active: tuple) -> mi.Float:
     """Share of the chains that are reflected: as the guides' vertices `of` do, on average, but for a defensive rest."""
-    total, count = mi.Float(0), mi.Float(0)
+    total, count, ctx = mi.Float(0), mi.Float(0), mi.BSDFContext()
     for si, alive in zip(of, active, strict=True):
         reflects, passes = _delta_kinds(si.bsdf())
         both = alive & reflects & passes
-        r, t = (dr.mean(mi.unpolarized_spectrum(_lobe(si, si.bsdf(), mi.Bool(p), both)[0])) for p in (False, True))
+        r, t = (dr.mean(mi.unpolarized_spectrum(_lobe(si, ctx, mi.Bool(p), both)[0])) for p in (False, True))
         known = both & (r + t > 0)
         total += dr.select(known, r / (r + t), 0)
         count += dr.select(known, mi.Float(1), 0)

@@ -17,7 +17,7 @@ seen from the other side of its shading normal, has a shading outline there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +27,7 @@ from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transf
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..plan.probe_motion import registry_table
-from .chain_patterns import NO_FAMILY, ChainPatterns
+from .chain_patterns import INSET, NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
@@ -208,3 +208,20 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
         F=F,
         valid=dr.isfinite(F),
     )
+
+
+def beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+    """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
+    ray = mi.Ray3f(pair.a.o, pair.a.d)
+    si = pair.a.intersection().compute_surface_interaction(ray, mi.RayFlags.All, curve.pattern)
+    across = curve.g * (INSET / dr.squared_norm(curve.g))
+    step = si.dp_du * across.x + si.dp_dv * across.y
+    crossed = curve.pattern & dr.all(dr.isfinite(step))
+
+    def moved(hit: Hit, side: mi.Float) -> Hit:
+        # From half of the way: beside its start there may be the surface that it has left.
+        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + side * step, hit.d)
+        there = Hit.of(ray, scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
+        return dr.select(crossed & (there.shape == hit.shape), there, hit)
+
+    return replace(pair, a=moved(pair.a, curve.side), b=moved(pair.b, -curve.side))

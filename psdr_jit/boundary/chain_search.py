@@ -11,7 +11,8 @@ As at most one part goes on, a lane of a kernel follows it, and past a crossing 
 waits for the next kernel; so do, while there are many, intervals that take longer than others.
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
-ends agree otherwise. Crossings of the first segment are not kept either: they belong to the primary boundary.
+ends agree otherwise. Crossings of segments before `lines.first_kept` are not kept either: of camera rays, those of the
+first segment belong to the primary boundary.
 """
 
 from __future__ import annotations
@@ -29,9 +30,6 @@ from .chain_lines import Lines
 #: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
 #: which probability one of them goes on where the ends agree: if they see a delta lobe, and elsewhere.
 PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
-
-#: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
-NARROWEST = 2.0**-10
 
 #: Width at which halving ends on steps that rest [px]: they are only walked around.
 AT_REST = 2.0**-4
@@ -61,7 +59,7 @@ class Interval:
 
 @dataclass
 class Crossing:
-    """An interval too short to be cut, whose ends see different surfaces at segment k > 0. Detached."""
+    """An interval too short to be cut, whose ends see different surfaces at segment k. Detached."""
 
     at: Interval
     k: mi.UInt32
@@ -71,11 +69,11 @@ def _uniform(key: mi.UInt32, which: int) -> mi.Float:
     return mi.Float(mi.sample_tea_32(key, mi.UInt32(which))[0] >> 8) * 2.0**-24
 
 
-def _part(at: Interval, specular: mi.Bool) -> tuple[mi.Bool, Interval]:
+def _part(at: Interval, specular: mi.Bool, narrowest: float) -> tuple[mi.Bool, Interval]:
     """`(is one looked at, which)`: a random part of an interval whose ends agree."""
     share = dr.select(specular, mi.Float(GO_ON), GO_ON_ELSEWHERE)
     choice = _uniform(at.key, 0) / share
-    chosen, part = (at.hi - at.lo > NARROWEST) & (choice < 1), dr.minimum(mi.UInt32(PARTS * choice), PARTS - 1)
+    chosen, part = (at.hi - at.lo > narrowest) & (choice < 1), dr.minimum(mi.UInt32(PARTS * choice), PARTS - 1)
 
     def cut(i: mi.UInt32) -> mi.Float:
         """The border between parts i − 1 and i."""
@@ -121,10 +119,11 @@ class Finds:
         self.found, self.goes_on = dr.zeros(mi.Bool, n), dr.zeros(mi.Bool, n)
         dr.make_opaque(self.crossing, self.before, self.found, self.goes_on)
 
-    def write(self, slot: mi.UInt32, crossing: Crossing, before: tuple[mi.Bool, Interval], active: mi.Bool) -> None:
+    def write(self, slot: mi.UInt32, find: tuple[mi.Bool, Crossing], before: tuple, active: mi.Bool) -> None:
+        """`find`: (is it kept, the crossing); `before`: (does its search go on, the interval in front of it)."""
         i, active = slot * self.stride + self.lane, active & (slot < SLOTS)
-        goes_on, interval = before
-        pairs = ((self.crossing, crossing), (self.before, interval), (self.found, crossing.k > 0),
+        (kept, crossing), (goes_on, interval) = find, before
+        pairs = ((self.crossing, crossing), (self.before, interval), (self.found, kept),
                  (self.goes_on, goes_on))  # fmt: skip
         for buffer, value in pairs:
             dr.scatter(buffer, value, i, active, mode=dr.ReduceMode.Permute)
@@ -157,11 +156,11 @@ def _searched(lines: Lines, search: Search, pause: tuple[mi.UInt32, mi.Bool], fi
         crossed &= ~again
         front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
-        crossing = Crossing(where, dr.select(moves, pair.k, 0))
-        finds.write(slot, crossing, _part(front, mi.Bool(True)), crossed)
+        find = moves & (pair.k >= lines.first_kept), Crossing(where, pair.k)
+        finds.write(slot, find, _part(front, mi.Bool(True), lines.narrowest), crossed)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
-        chosen, part = _part(at, pair.specular | checked)
+        chosen, part = _part(at, pair.specular | checked, lines.narrowest)
         behind = Interval(at.sample, hi, at.hi, at.weight, _key(at, 1))
         halved = apart | halve | again
         ends = ((look & ~apart) | (checked & ~crossed & ~again)) & ~chosen

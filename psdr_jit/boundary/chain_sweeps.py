@@ -19,6 +19,7 @@ from ..core.ad import tangents
 from ..core.records import Hit
 from ..paths.delta_step import delta_step
 from ..plan.motion import Displacements, Motion, SceneDisplacements
+from ..scene.facts import SceneFacts
 from .chain_trace import ChainRecords
 
 
@@ -85,3 +86,16 @@ def carry_adjoints(chain: ChainRecords, last: mi.UInt32, λ_o: mi.Vector3f, λ_d
             λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
         active = k > 0
     return λ_o, λ_d
+
+
+def slope_at_end(facts: SceneFacts, chain: ChainRecords, end, camera: tuple, motion: Motion) -> mi.Float:
+    """Tangent of F at the `end` of chains, given the tangents `camera` of their first rays. Detached.
+
+    `end` has a `segment`, a `curve`, and an `attached_F` of the line of sight there.
+    """
+    o_grad, d_grad = carry_tangents(chain, end.segment, *camera, motion)
+    o, d = mi.Point3f(end.curve.line.o), mi.Vector3f(end.curve.line.d)
+    with motion.attached(o, d) as moving:
+        dr.set_grad(o, o_grad)
+        dr.set_grad(d, d_grad)
+        return tangents(end.attached_F(o, d, moving, facts))

@@ -15,6 +15,7 @@ for rays that are far apart, which costs time, and is right for those close by, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -50,6 +51,8 @@ class ChainWorld:
     moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape
     camera: mi.Bool  # may they because the camera does, ...
     lights: mi.Bool  # ... or because lights do?
+    connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
+    mode: mi.TransportMode  # of what is carried from there: radiance, or importance
 
     @staticmethod
     def of(job: Job) -> ChainWorld:
@@ -66,6 +69,8 @@ class ChainWorld:
             moving=registry_table(job.scene, changing),
             camera=varying(mi.Bool, facts.camera_moves),
             lights=varying(mi.Bool, lights),
+            connects=compare_light,
+            mode=mi.TransportMode.Radiance,
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
@@ -170,8 +175,8 @@ def guide(world: ChainWorld, rays: tuple[mi.Ray3f, mi.Ray3f], rng, sampler, line
     `rng` as for `trace_pair`. Fills `out`.
     """
     ray_a, ray_b, k = mi.Ray3f(rays[0]), mi.Ray3f(rays[1]), mi.UInt32(0)
-    in_a, in_b = mi.Bool(True), mi.Bool(True)
-    while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out]):
+    in_a, in_b, ctx = mi.Bool(True), mi.Bool(True), mi.BSDFContext(world.mode)
+    while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out, ctx]):
         a = world.scene.ray_intersect(ray_a, mi.RayFlags.All, False, in_a)
         b = world.scene.ray_intersect(ray_b, mi.RayFlags.All, False, in_b)
         in_a, in_b = in_a & a.is_valid(), in_b & b.is_valid()
@@ -180,7 +185,7 @@ def guide(world: ChainWorld, rays: tuple[mi.Ray3f, mi.Ray3f], rng, sampler, line
         fixed = draw_direction(a, sampler, smooth & in_a)
         fixed.reflected = reflected_share((a, b), (in_a, in_b))
         out.write(k, line, fixed)
-        on_a, on_b = leave(a, k, u.lobe, fixed, in_a), leave(b, k, u.lobe, fixed, in_b)
+        on_a, on_b = leave(a, k, u.lobe, fixed, in_a, ctx), leave(b, k, u.lobe, fixed, in_b, ctx)
         ray_a, in_a, ray_b, in_b = on_a.ray, on_a.alive, on_b.ray, on_b.alive
         k += 1
 
@@ -198,9 +203,9 @@ def trace_pair(
     `fixed`: the directions of all lines, and the number of this one.
     """
     ray_a, ray_b = mi.Ray3f(rays[0]), mi.Ray3f(rays[1])
-    directions, line = fixed
+    (directions, line), ctx = fixed, mi.BSDFContext(world.mode)
     active, pair = mi.Bool(True), Pair.start()
-    while dr.hint(active, label="psdr.chain.pair", exclude=[world, directions, store]):
+    while dr.hint(active, label="psdr.chain.pair", exclude=[world, directions, store, ctx]):
         pi_a = world.scene.ray_intersect_preliminary(ray_a, coherent=False, active=active)
         pi_b = world.scene.ray_intersect_preliminary(ray_b, coherent=False, active=active)
         a = pi_a.compute_surface_interaction(ray_a, mi.RayFlags.All)
@@ -218,10 +223,11 @@ def trace_pair(
         u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
 
-        pair = compare_light(world, pair, (a, b), u, active & (pair.k > 0))
+        pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
         active &= ~pair.differs
         direction = directions.read(pair.k, line, active)
-        on_a, on_b = leave(a, pair.k, u.lobe, direction, active), leave(b, pair.k, u.lobe, direction, active)
+        on_a = leave(a, pair.k, u.lobe, direction, active, ctx)
+        on_b = leave(b, pair.k, u.lobe, direction, active, ctx)
         if dr.hint(store is not None, mode="scalar"):
             store.write_bend(pair.k, on_a.by_delta, active)
         active = on_a.alive & on_b.alive

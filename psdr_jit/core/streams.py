@@ -31,6 +31,8 @@ class Stream(IntEnum):
     HORIZON_SUBPATH = 17
     HORIZON_VIEW = 18
     LIGHT_SUBPATH = 19
+    LIGHT_CHAIN = 20
+    LIGHT_CHAIN_PILOT = 21
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

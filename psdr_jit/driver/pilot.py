@@ -139,7 +139,9 @@ def measure(
                            for k in range(IMAGES)])
                 for spp, tally in tallies.items()
             )  # fmt: skip
-            noise = TermNoise.between(float(few.mean()), float(more.mean()), term.cost(form, sky))
+            lit = job_of(form, FIRST_SEED, FEW).light is not None
+            cost = term.cost(form, sky) * (term.with_light if lit else 1)
+            noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
             if term.over_film:
                 noise = noise.spread(few, more)
             if term.through_edges:

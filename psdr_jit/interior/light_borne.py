@@ -16,7 +16,8 @@ As y_1 stays, the outline of a body as the light sees it is no discontinuity: E 
 keeps its edge. The camera moves as if everything else moved the other way.
 
 Not in here: that something else comes between the light and y_1, that a later vertex goes past an edge, and that y_s
-goes behind something that hides it from the camera, moving or not. `record` warns of that.
+goes behind something that hides it from the camera: `boundary/light_chain.py`. Nor that a pixel sees another area J
+when the field of view changes: `record` warns of that.
 """
 
 from __future__ import annotations
@@ -98,11 +99,11 @@ def record(
             'use a smooth reconstruction filter, <rfilter type="gaussian"/>, or light_paths="off", which leaves that '
             "light out"
         )
-    if job.facts.geometry_moves:
+    if any(name.endswith("x_fov") for name in job.facts.sensor.pose):
         warn_once(
-            "light of points by way of mirrors and smooth glass has no boundary terms: its derivative is right where "
-            "nothing comes between the light and the first surface, the light passes no edges from there on, and "
-            "nothing hides a part of what it shines on from the camera",
+            "while the field of view is differentiated, light of points by way of mirrors and smooth glass moves over "
+            "the film, but does not get brighter or darker as pixels see more or less of what it shines on; move the "
+            "camera instead",
             UnsupportedWarning,
             job.call.memory,
         )
@@ -262,7 +263,9 @@ def backward(found: LightBorne, grad_in: mi.TensorXf) -> None:
         backpropagate(_splat(found, p, value), grad_in)
         δrate, δp = dr.grad(value) * dr.detach(value), dr.grad(p)
     films.clear(found.job.film)
-    λ_o, λ_d = _backward_sweep(found, δrate, δp)
+    rejected = found.job.call.counters.rejected
+    δrate, δp = rejected.keep_finite(δrate), rejected.keep_finite(δp)
+    λ_o, λ_d = (rejected.keep_finite(λ) for λ in _backward_sweep(found, δrate, δp))
     with found.job.motion.attached() as moving:
         o, d, carried = _leave(found, moving)
         accumulate(dr.dot(λ_o, o) + dr.dot(λ_d, d) + dr.sum(δrate * carried))

@@ -34,7 +34,8 @@ from ..paths.bounce import PathLimits
 from ..paths.delta_step import delta_step
 from ..paths.light_source import LightStart
 from ..paths.light_technique import average
-from ..paths.light_walk import LightPath, LightVertices, trace_light
+from ..paths.light_vertices import LightVertices
+from ..paths.light_walk import LightPath, trace_light
 from ..paths.rays import interaction, shadow_hit
 from ..paths.recording import GRAZING, PathRecords
 from ..plan.job import Job

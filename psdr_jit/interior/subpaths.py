@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..paths.light_walk import LightVertex, LightVertices
+from ..paths.light_vertices import LightVertex, LightVertices
 
 
 class Subpaths:

@@ -59,9 +59,8 @@ class LightSources:
 
         shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, chosen))
         on = shape.sample_position(0, u, ~delta)
-        of_delta, _ = emitter.sample_ray(0, 0, mi.Point2f(0.5), mi.Point2f(0.5), delta)
         si = mi.SurfaceInteraction3f(on, wavelengths)
-        si.p = dr.select(delta, of_delta.o, si.p)
+        si.p = dr.select(delta, place_of(emitter, delta), si.p)
         si.n = dr.select(delta, 0, si.n)
         si.wavelengths = wavelengths
         ω = self._aim(si.p, u_target, v)
@@ -77,7 +76,7 @@ class LightSources:
         scaled = u * n
         ω = mi.Vector3f(0, 0, 1)
         for i, ball in enumerate(self.targets):
-            axis, cos_max, _ = _cone(ball, y)
+            axis, cos_max, _ = cone(ball, y)
             of_ball = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(v, cos_max))
             ω = dr.select((scaled >= i) | (i == 0), of_ball, ω)
         return ω
@@ -86,7 +85,7 @@ class LightSources:
         """Density p(ω) per solid angle of `_aim`."""
         pdf = mi.Float(0)
         for ball in self.targets:
-            axis, cos_max, inverse_angle = _cone(ball, y)
+            axis, cos_max, inverse_angle = cone(ball, y)
             pdf += dr.select(dr.dot(axis, ω) >= cos_max, inverse_angle, 0)
         return pdf / len(self.targets)
 
@@ -107,7 +106,13 @@ class LightSources:
         return dr.select(known & (light > 0) & dr.isfinite(E), E, 0)
 
 
-def _cone(ball: tuple[mi.Point3f, mi.Float], y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+def place_of(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Point3f:
+    """Where point and spot lights are. Not by `sample_ray`, which textures on other lights may not know. Detached."""
+    ds, _ = emitter.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), active)
+    return mi.Point3f(dr.detach(ds.p))
+
+
+def cone(ball: tuple[mi.Point3f, mi.Float], y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
     """The cone in which `y` sees a ball: `(unit axis, cosine of its half angle, 1/Ω)`; all directions from inside."""
     centre, radius = ball
     to_centre = centre - y

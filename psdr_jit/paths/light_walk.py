@@ -28,51 +28,19 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..core.records import Hit
 from ..core.sensor_frame import View, look_at
-from ..core.surface_code import surface_code
-from ..core.varying import varying
 from .bounce import PathLimits, PathState, bounce
 from .delta_step import delta_step
 from .light_source import LightStart
 from .light_technique import SHORTEST, LightTechnique, average, cosine_ratio, focuses
+from .light_vertices import LightVertices
 from .rays import interaction
 from .scattering import Mixture, Scattering, delta_probability, mixture_pdf
 from .sensor_connection import on_film, seen_by_sensor
 
 #: Share of what is black in the probability of being kept, where the derivative of what is black is wanted.
 BLACK_SHARE = 0.05
-
-
-@dataclass
-class LightVertex:
-    """A vertex of a light subpath, enough to find it again."""
-
-    x: mi.Point3f
-    shape: mi.UInt32  # its `surface_code`
-    prim_index: mi.UInt32
-    prim_uv: mi.Point2f
-    delta: mi.Bool  # left by a delta lobe, away from the light
-
-
-class LightVertices:
-    """Memory for the vertices of `lanes` light subpaths, vertex-major. A plain class: never loop state."""
-
-    BYTES = 4 * 7 + 1  # of one vertex
-
-    def __init__(self, lanes: int, depth: int):
-        size = lanes * depth
-        self.stride = varying(mi.UInt32, lanes)
-        self.lane = dr.arange(mi.UInt32, lanes)
-        types = (mi.Point3f, mi.UInt32, mi.UInt32, mi.Point2f, mi.Bool)
-        self.data = LightVertex(*(dr.empty(kind, size) for kind in types))
-
-    def write(self, k: mi.UInt32, si: mi.SurfaceInteraction3f, pi, delta: mi.Bool, active: mi.Bool) -> None:
-        uv = mi.Point2f(pi.prim_uv)
-        vertex = LightVertex(si.p, surface_code(pi), mi.UInt32(pi.prim_index), uv, mi.Bool(delta))
-        dr.scatter(self.data, vertex, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
-
-    def read(self, k: mi.UInt32, lane: mi.UInt32, active: mi.Bool) -> LightVertex:
-        return dr.gather(LightVertex, self.data, k * self.stride + lane, active)
 
 
 @dataclass
@@ -193,7 +161,18 @@ def _connected(
     return LightPath(value, carried.scale * end * w, s, carried.alone, view.p, view.film, aperture, zero, own), view
 
 
-@dr.syntax
+@dataclass
+class Onset:
+    """Where a light subpath is taken up: the segment in hand, what it carries, and what lies behind it. A PyTree."""
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f  # what it meets
+    carried: _Carried
+    path: PathState
+    delta: mi.Bool  # the light is a delta light
+    pdf_em: mi.Float  # density of an emitter sample at the first vertex
+
+
 def trace_light(
     scene: mi.Scene,
     sampler,
@@ -206,21 +185,53 @@ def trace_light(
 
     `limits`: of the camera's paths, with their `light`.
     """
-    technique = limits.light
-    own = replace(limits, uniform_share=0.0, critical=technique.critical, light=None)
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
     ray = mi.Ray3f(start.ray)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=True)
-    carried, pdf_em = _first_segment(scene, technique, start, pi, limits)
+    carried, pdf_em = _first_segment(scene, limits.light, start, pi, limits)
+    onset = Onset(ray, pi, carried, PathState.start(), start.delta, pdf_em)
+    return _follow(scene, sampler, onset, limits, (hide_emitters, False), vertices)
+
+
+def take_up(
+    scene: mi.Scene,
+    sampler,
+    hit: Hit,
+    β: mi.Spectrum,
+    k: mi.UInt32,
+    wavelengths,
+    limits: PathLimits,
+    hide_emitters: bool,
+) -> LightPath:
+    """Go on along the segments `hit`, number `k` of paths from points of light, which carry `β`. Detached.
+
+    None but paths count that nothing else finds (`LightPath.alone`): behind the first segment they must be such.
+    """
+    ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
+    pi = hit.intersection()
+    carried = _Carried.of(dr.select(pi.is_valid(), β, 0), mi.Float(1))
+    carried.alone, carried.U = k > 0, mi.Float(0)
+    onset = Onset(ray, pi, carried, PathState(mi.UInt32(k), mi.Spectrum(1), mi.Float(1)), mi.Bool(True), mi.Float(0))
+    return _follow(scene, sampler, onset, limits, (hide_emitters, True), None)
+
+
+@dr.syntax
+def _follow(
+    scene: mi.Scene, sampler, onset: Onset, limits: PathLimits, only: tuple[bool, bool], vertices: LightVertices | None
+) -> LightPath:
+    """`only`: (hidden emitters are transparent, none but paths that are `alone` count)."""
+    technique, (hide_emitters, only_alone) = limits.light, only
+    own = replace(limits, uniform_share=0.0, critical=technique.critical, light=None)
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ray, pi, carried, path = onset.ray, onset.pi, onset.carried, onset.path
+    delta_light, pdf_em = onset.delta, onset.pdf_em
     kept = LightPath.none()
-    path = PathState.start()
     active = pi.is_valid() & (carried.scale > 0)
-    while dr.hint(active, label="psdr.light_walk", exclude=[technique, limits, own]):
+    while dr.hint(active, label="psdr.light_walk", exclude=[technique, limits, own, only_alone]):
         si = interaction(pi, ray, limits)
         bsdf = si.bsdf()
         first = path.k == 0
         s = path.k + 1
-        ends = active & (s >= SHORTEST)
+        ends = active & (s >= SHORTEST) & (carried.alone | ~mi.Bool(only_alone))
         found, view = _connected(technique, sampler.next_2d(), si, s, carried, limits, ends)
         found.own = dr.select(seen_by_sensor(scene, si, view, hide_emitters, found.own > 0), found.own, 0)
         kept = kept.offered(found, sampler.next_1d())
@@ -232,7 +243,7 @@ def trace_light(
         alive = onward.alive & (s < technique.longest)
         turn = _turn(technique, onward.scattering, si, bsdf, limits, alive)
         step = turn.step / onward.scattering.pdf
-        p = dr.select(first, _root(start, turn.p, dr.select(delta, 0, pdf_em)), turn.p)
+        p = dr.select(first, _root(delta_light, turn.p, dr.select(delta, 0, pdf_em)), turn.p)
         carried = dr.select(
             alive,
             _Carried(
@@ -240,7 +251,7 @@ def trace_light(
                 carried.scale * step / onward.survival,
                 carried.U * p * step,
                 carried.likely * turn.p * step / onward.survival,
-                carried.alone | (first & start.delta & delta),
+                carried.alone | (first & delta_light & delta),
             ),
             carried,
         )
@@ -260,6 +271,6 @@ def _turn(technique: LightTechnique, s: Scattering, si, bsdf: mi.BSDFPtr, limits
     return dr.select(s.delta, _Turn.by_delta(s.wo, si, bsdf, limits.mixture, active & s.delta), smooth)
 
 
-def _root(start: LightStart, p: mi.Float, pdf_em: mi.Float) -> mi.Float:
+def _root(delta_light: mi.Bool, p: mi.Float, pdf_em: mi.Float) -> mi.Float:
     """√(p_B² + p_N²) at x_s: a delta light is not met by scattering."""
-    return dr.sqrt(dr.select(start.delta, 0, dr.square(p)) + dr.square(pdf_em))
+    return dr.sqrt(dr.select(delta_light, 0, dr.square(p)) + dr.square(pdf_em))

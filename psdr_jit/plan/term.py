@@ -46,4 +46,5 @@ class Term:
     backward: Callable[[Job, mi.TensorXf], None]
     edges: EdgeSampling | None = None
     through_edges: bool = False  # its samples are lines through edges that can be guided
+    with_light: float = 1.0  # factor on the cost where light subpaths run
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy

@@ -1,0 +1,282 @@
+"""The boundary of smooth caustics: steps of what points of light send to the film by way of mirrors and smooth glass.
+
+The interior term follows such light from its side (`interior/light_borne.py`): with q on the light's own film
+(`light_chain_lines`), and y_1, …, y_s the path that the light leaves there by ω(q), a pixel with the filter h is
+
+    I = ∫ g(q) dω(q) …,        g = h(p) Φ(ω) Π_k w_k
+
+Φ the light's intensity [W/sr], w_k lobe by lobe, and at y_s the BSDF over the area that a pixel sees. The first
+vertex y_1 stays on its surface, so q moves with it. g steps where two neighbouring paths part: where one goes past
+an edge, or where the sensor sees one of the two ends y_s only. Along a line X across q the crossed curve is met where
+F(X, θ) = 0, as seen by lines of the camera (`chain.py`). Then, with F_θ the derivative of F along the flow, y_1 fixed,
+
+    dI ∋ (g_a − g_b) · (Ẋ − q̇),        Ẋ − q̇ = −F_θ/F_X,        a before b along the line,
+
+times solid angle per line. Both sides land on the film in places of their own, p_a and p_b. Behind the first segment
+they share y_1, hence the flow. At the first they do not: each side then has the speed of the edge past its own y_1,
+
+    dI ∋ g_a · (−F_θ^a/F_X) − g_b · (−F_θ^b/F_X).
+
+For the surface that ends in the edge itself, F_θ = 0: its material does not pass its own border. What is left is the
+other side, light that something comes in between of, or no longer does.
+
+Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts or touches what
+it shines on, rays that leave it beside the cut start beyond that: the step there is missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.ad import accumulate, backpropagate, tangents
+from ..core.low_discrepancy import lane_sampler
+from ..core.records import Hit
+from ..core.sensor_frame import lens_point
+from ..core.streams import Stream, stream_seed
+from ..paths.bounce import particle_correction
+from ..paths.light_walk import take_up
+from ..plan.job import Job, passes
+from ..plan.motion import Displacements
+from ..scene.facts import SceneFacts
+from .chain_fixed import Directions
+from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
+from .chain_search import find_crossings
+from .chain_sweeps import AtRest, carry_adjoints, slope_at_end
+from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
+from .light_chain_lines import LightCells, LightLine, LightLines, sensor_view
+
+#: Largest distance from a crossing to the curve that it is thought to belong to, in cells: halving ends closer.
+MOST_OFF = 0.02
+
+#: Memory of one line, as in `chain`.
+BYTES = 256 + CHAIN_DEPTH * Directions.BYTES
+
+#: Share of the lines that tell where others should be.
+PILOT_SHARE = 0.25
+
+#: Lines for each line across the film that the chain term looks at.
+SHARE = 0.5
+
+
+@dataclass
+class LightEnd:
+    """The last line of sight of chains from lights, which the crossed curve is on. Detached."""
+
+    segment: mi.UInt32  # its number
+    curve: Curve
+    to_sensor: mi.Bool  # it is one of the sensor, from behind
+    film: mi.Point2f  # where it lands, in [0, 1]² of the crop window
+    aperture: mi.Point2f
+    lens: mi.Point3f  # the point that it comes from; of an orthographic sensor, unused
+    distance: mi.Float  # of that point; infinite for an orthographic sensor
+
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, facts: SceneFacts) -> mi.Float:
+        """F of the attached line of sight; one of the sensor follows its ends, in place of the direction `d`."""
+        line = self.curve.line
+        aimed = mi.Vector3f(line.d)
+        if facts.camera_moves:
+            near = dr.isfinite(self.distance)
+            shift = moving.of_camera(self.film, self.aperture, self.lens)
+            turn = -moving.of_view(self.film, self.aperture, -line.d)
+            aimed += dr.select(near, shift / self.distance, turn)
+        aimed -= (o - dr.detach(o)) / self.distance
+        d = dr.select(self.to_sensor, dr.normalize(aimed), d)
+        on_surface = any(s.smooth or s.patterns for s in facts.shapes)
+        return self.curve.attached_F(o, d, moving, on_surface)
+
+
+@dataclass
+class Side:
+    """What is on one side of the crossings, and how fast they pass it. Detached, one entry per crossing."""
+
+    first: Hit  # the first segment: where y_1 is
+    emitter: mi.UInt32
+    p: mi.Point2f  # where its light lands on the film [px]
+    value: mi.Spectrum  # contribution per unit of F_θ
+    valid: mi.Bool
+
+
+@dataclass(frozen=True)
+class LightSteps:
+    """Host object."""
+
+    chain: ChainRecords
+    end: LightEnd
+    sides: tuple[Side, Side]
+    wavelengths: mi.Color0f
+    place: mi.UInt32  # number of the cell
+    worth: mi.Float  # what the crossing brings there per unit of F_θ, whatever led to it
+
+
+def _intensity(line: LightLine, ω: mi.Vector3f, wavelengths) -> mi.Spectrum:
+    """Φ in the direction ω: the irradiance at a distance of 1."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p, si.wavelengths = line.y + ω, wavelengths
+    _, E = dr.reinterpret_array(mi.EmitterPtr, line.emitter).sample_direction(si, mi.Point2f(0.5))
+    return E
+
+
+def _sent_on(job: Job, pair: Pair, side: int, Φ: mi.Spectrum, wavelengths) -> tuple[mi.Point2f, mi.Spectrum]:
+    """Where the light of segments that have parted lands on the film, and g there."""
+    hit, β = (pair.b, pair.β_b) if side else (pair.a, pair.β_a)
+    rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), dr.arange(mi.UInt32, dr.width(pair.k)))
+    β = dr.select(pair.in_light, 0, Φ * β)
+    limits = replace(job.limits, light=job.light)
+    path = take_up(job.scene, rng, hit, β, pair.k, wavelengths, limits, job.options.hide_emitters)
+    return path.p, dr.select(path.count > 0, path.value, 0)
+
+
+def _connected(job: Job, pair: Pair, chain: ChainRecords, Φ: mi.Spectrum, wavelengths):
+    """Of vertices that the sensor sees on one side only: `(where that lands, g if seen, view, lens point)`."""
+    hit = chain.segment(pair.k, pair.in_light)
+    ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
+    view, aperture = sensor_view(job.frame, si.p, pair.light.u)
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    f = si.bsdf().eval(ctx, si, si.to_local(-view.ω), pair.in_light) * particle_correction(si, -view.ω)
+    return view, aperture, dr.select(pair.in_light, Φ * pair.β_a * f / view.J_px, 0)
+
+
+def _steps(lines: LightLines | None) -> LightSteps | None:
+    """Everything about the crossings of lines but how fast they pass; None if there are none."""
+    found = None if lines is None else find_crossings(lines)
+    if found is None:
+        return None
+    job = lines.job
+    chain = ChainRecords(dr.width(found.k), lines.world.depth)
+    pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
+    dr.eval(pair, chain.hits, chain.bends)
+    curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
+    dr.eval(curve)
+    line = lines.line(found.at.sample)
+    p = line.at(found.at.lo)
+    wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
+    Φ = _intensity(line, line.direction(p), wavelengths) * weight
+    if lines.world.patterns is not None:
+        pair = beside_line(job.scene, pair, curve)
+    view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
+    end = _end(job, pair, curve, view, aperture)
+
+    F_x, F_y = (_slope_across(lines, chain, end, (p, line, axis)) for axis in (0, 1))
+    slope2 = dr.square(F_x) + dr.square(F_y)
+    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
+    along = dr.select(line.horizontal, F_x, F_y)
+    per_F = dr.select(valid, -along / slope2 * lines.measure(line, p), 0)
+    sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
+    for i, hit in enumerate((pair.a, pair.b)):
+        landed, g = _sent_on(job, pair, i, Φ, wavelengths)
+        g += dr.select(pair.seen ^ mi.Bool(i == 1), at_end, 0)
+        value = job.call.counters.rejected.keep_finite(g * dr.select(mi.Bool(i == 1), -per_F, per_F))
+        worth += dr.max(dr.abs(value))
+        value *= weight
+        first = dr.select(pair.k == 0, hit, chain.segment(mi.UInt32(0), mi.Bool(True)))
+        sides.append(Side(first, line.emitter, dr.select(pair.in_light, view.p, landed), value, dr.any(value != 0)))
+    steps = LightSteps(chain, end, tuple(sides), wavelengths, line.place, worth)
+    dr.eval(end, sides, wavelengths, steps.place, worth)
+    return steps
+
+
+def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> LightEnd:
+    """The last line of sight; `view` and `aperture`: of the shared vertex where it is one of the sensor."""
+    frame = job.frame
+    lens, distance = view.o, mi.Float(dr.inf)
+    if frame.kind != "orthographic":
+        lens = frame.to_world @ lens_point(frame, aperture)
+        distance = dr.norm(lens - curve.line.o)
+    return LightEnd(pair.last, curve, pair.in_light, view.film, aperture, lens, distance)
+
+
+def _slope_across(lines: LightLines, chain: ChainRecords, end: LightEnd, at: tuple) -> mi.Float:
+    """Derivative of F by the place on the light's film [m/cell], along the axis of `at`: (place, line, axis)."""
+    p, line, axis = at
+    q = mi.Point2f(p)
+    with dr.resume_grad():
+        dr.enable_grad(q)
+    with dr.resume_grad(q):
+        dr.set_grad(q, mi.Point2f(1 - axis, axis))
+        d_grad = tangents(line.direction(q))
+    at_rest = AtRest(lines.job.sensor)
+    return slope_at_end(lines.job.facts, chain, end, (mi.Vector3f(0), d_grad), at_rest)
+
+
+def _leave(moving: Displacements, side: Side) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """The motion of the first segments, whose ends y_1 are fixed on their surfaces: of starts and directions."""
+    hit = side.first
+    t = dr.select(hit.shape != 0, hit.t, 1)
+    it = dr.zeros(mi.Interaction3f)
+    it.p = hit.o + hit.d * t
+    of_light, _ = moving.of_light(dr.reinterpret_array(mi.EmitterPtr, side.emitter), it, mi.Bool(True))
+    across = (moving.of_surface(hit) - of_light) / t
+    return of_light, across - hit.d * dr.dot(hit.d, across)
+
+
+def _parts(job: Job) -> Iterator[tuple[float, Job, LightSteps]]:
+    """The steps of a job, pass by pass, with their shares."""
+    pixels = int(job.film.crop_size()[0]) * int(job.film.crop_size()[1])
+    for share, part in passes(job, BYTES):
+        count = round(SHARE * part.spp * pixels)
+        pilot = replace(part, call=replace(part.call, seed=stream_seed(part.seed, Stream.LIGHT_CHAIN_PILOT)))
+        lines = LightLines.of(pilot, job.light, max(1, round(PILOT_SHARE * count)))
+        known = _steps(lines)
+        cells = None if known is None else _spread(lines, known)
+        steps = _steps(LightLines.of(part, job.light, max(1, round((1 - PILOT_SHARE) * count)), cells))
+        if steps is not None:
+            yield share, part, steps
+
+
+def _spread(lines: LightLines, found: LightSteps) -> LightCells:
+    """Where to look again, by what a pilot's lines have found."""
+    squared = dr.zeros(mi.Float, lines.cells.count)
+    dr.scatter_add(squared, dr.square(found.worth), found.place)
+    return LightCells.guided(squared)
+
+
+def _splat(job: Job, steps: LightSteps, side: Side, value: mi.Spectrum) -> mi.TensorXf:
+    return films.develop_splats(job.film, side.p, value, steps.wavelengths, side.valid)
+
+
+def forward(job: Job) -> mi.TensorXf:
+    """Derivative image along the tangents set on the scene's parameters. Detached; `dr.suspend_grad` is on."""
+    image = films.black(job.film)
+    for share, part, steps in _parts(job):
+        for side in steps.sides:
+            with job.motion.attached() as moving:
+                first = tangents(*_leave(moving, side))
+            F_grad = slope_at_end(job.facts, steps.chain, steps.end, first, job.motion)
+            value = job.call.counters.rejected.keep_finite(side.value * F_grad)
+            image += share * _splat(part, steps, side, value)
+    return image
+
+
+def backward(job: Job, grad_in: mi.TensorXf) -> None:
+    """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`."""
+    for share, part, steps in _parts(job):
+        for side in steps.sides:
+            λ = share * _adjoint(part, steps, side, grad_in)
+            λ = job.call.counters.rejected.keep_finite(mi.Color1f(λ)).x
+            line = steps.end.curve.line
+            o, d = mi.Point3f(line.o), mi.Vector3f(line.d)
+            with job.motion.attached(o, d) as moving:
+                accumulate(λ * steps.end.attached_F(o, d, moving, job.facts))
+                λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
+            λ_o, λ_d = carry_adjoints(steps.chain, steps.end.segment, λ_o, λ_d, job.motion)
+            dr.eval(λ_o, λ_d)
+            with job.motion.attached() as moving:
+                o, d = _leave(moving, side)
+                accumulate(dr.dot(λ_o, o) + dr.dot(λ_d, d))
+            dr.eval()
+
+
+def _adjoint(job: Job, steps: LightSteps, side: Side, grad_in: mi.TensorXf) -> mi.Float:
+    """Derivative of ⟨grad_in, image⟩ by F_θ of every crossing."""
+    with dr.resume_grad():
+        F_grad = dr.zeros(mi.Float, dr.width(steps.end.segment))
+        dr.enable_grad(F_grad)
+    with dr.resume_grad(F_grad):
+        backpropagate(_splat(job, steps, side, side.value * F_grad), grad_in)
+        return dr.grad(F_grad)
