@@ -3,7 +3,6 @@
 One way a gap opens, through which one looks into the dark; the other way one shape sinks into the other, and the line
 where they meet stays where it is. The terms see neither of the two: for them the edge moves over what it rests on.
 Sliding along the contact is fine. Needs the direction of the derivative, which only forward mode has.
-The material form is off wherever shapes of different velocity touch, however they move.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from .contacts import Contact
 from .intersections import TriangleMesh, barycentric
-from .segments import EdgeSet
 from .solids import Solid, triangles
 from .touching import Resting
 
@@ -53,30 +51,6 @@ def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
                 UnsupportedWarning,
                 job.call.memory,
             )
-
-
-def warn_about_material(job: Job, found: EdgeSet) -> None:
-    """Say that the material form leaves something out where light goes between shapes that touch, once.
-
-    For x on the one shape and y on the other, at the distances a and b from where they meet, the derivative of the
-    geometry term is of degree −2 in (a, b), so that its integral over both depends on the shape of the corner that is
-    left out. What rays cannot resolve, starting a little above surfaces, is a corner of the wrong shape; the rest that
-    it leaves does not depend on its size: 10 to 14 % of the derivative of a box that slides on, or in, a floor.
-    """
-    if job.form != "material" or job.options.depth_limit < 3 or dr.flag(dr.JitFlag.FreezingScope):
-        return
-    touching = [f"shapes '{c.a.mesh.id()}' and '{c.b.mesh.id()}' touch" for c in found.contacts
-                if c.a.moves != c.b.moves]  # fmt: skip
-    if found.junctions is not None and dr.any(found.junctions.edges.moves):
-        touching.append("shapes cut into each other")
-    if touching:
-        warn_once(
-            f"{touching[0]} and move against each other: in the material form, which this integrator was asked for, "
-            "the light that goes from one to the other where they meet is wrong (10 % of the derivative) and noisy; "
-            "use form='spatial', or 'auto', which knows of contacts",
-            UnsupportedWarning,
-            job.call.memory,
-        )
 
 
 def _velocities(solid: Solid) -> np.ndarray:

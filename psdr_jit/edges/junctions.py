@@ -11,7 +11,7 @@ which needs no derivative of the intersection points themselves.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -70,11 +70,12 @@ class JunctionTable:
 
     edges: EdgeRows
     rows: JunctionRows
+    pairs: tuple[tuple[Solid, Solid | Ball], ...] = ()  # of what they are
 
 
 def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> JunctionTable | None:
     """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `memory`."""
-    found, changed = [], False
+    found, pairs, changed = [], [], False
     for a, b in _pairs(solids, balls, memory):
         key = (a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
         state = (state_of(a), state_of(b))
@@ -85,13 +86,14 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
             changed = True
         if known[1] is not None:
             found.append(known[1])
+            pairs.append((a, b))
     if not found:
         return None
     table = memory[UPLOADED]
     if changed or table is None or table[0] != [id(f) for f in found]:
         table = ([id(f) for f in found], _upload(found), found)
         memory[UPLOADED] = table
-    return table[1]
+    return replace(table[1], pairs=tuple(pairs))
 
 
 def _pairs(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> list[tuple[Solid, Solid | Ball]]:

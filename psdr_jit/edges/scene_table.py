@@ -25,7 +25,8 @@ from ..scene.grids import VALUES, blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
-from .contact_motion import warn_about_material, warn_about_parting
+from .contact_limits import warn_about_lamps, warn_about_material
+from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import GridPlace, edge_shapes
 from .kind import EdgeKind
@@ -78,6 +79,7 @@ def edge_table(job: Job) -> EdgeTable:
     straight = _edge_set(job, meshes, balls)
     warn_about_parting(job, straight.contacts)
     warn_about_material(job, straight)
+    warn_about_lamps(job, straight)
     kinds, hidden = _between_faces(job, straight, meshes, overlapping, centre)
     curves = _analytic(job, analytic, centre)
     if curves is not None:

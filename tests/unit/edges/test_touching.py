@@ -135,6 +135,22 @@ def test_material_form_at_contacts_is_named(llvm, height, form, depth, said):
     assert any("material form" in str(w.message) for w in found) == said
 
 
+@pytest.mark.parametrize(
+    ("centre", "lit", "said"),
+    [((0, 0.2, 0), "still", True), ((0, 0.1, 0), "still", True), ((0, 0.1, 0), "moved", True),
+     ((0, 0.1, 0), None, False), ((0, 0.4, 0), "still", False), ((0, 0.2, 0), "moved", False)],
+)  # fmt: skip
+def test_what_stands_on_a_light_is_named(llvm, centre, lit, said):
+    """A box on, in and above a larger one, of which one shines; what stands on another covers nothing of itself."""
+    shapes = {"still": cube((0, -0.3, 0), (0.3,) * 3), "moved": cube(centre, (0.2,) * 3)}
+    if lit:
+        shapes[lit]["emitter"] = {"type": "area"}
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        edges_of(scene_of(shapes), "moved.vertex_positions", {"direction": AXES["x"]})
+    assert any("area light" in str(w.message) for w in found) == said
+
+
 def test_common_parts_are_counted_once(llvm):
     """Along the line on which edges of two boxes overlap, rows of the table cover each point once."""
     rows = edges_of(scene_of(shapes_of("flush in front")), "camera.to_world", {"direction": AXES["x"]}).kinds[0].rows
