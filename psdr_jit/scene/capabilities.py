@@ -122,8 +122,8 @@ SUPPORT = (
     Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge, and so is the plane of a face far off its normals; light from such a mesh "
-        "onto others: 1 to 5 % off; lights, mirrors and, under point, spot and directional lights, any with normals "
-        "far off their faces: warning"),
+        "onto others: 1 to 5 % off; lights, mirrors, two-sided bodies and, under point, spot and directional lights, "
+        "any with normals far off their faces: warning"),
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, SDF grids that are turned or have unequal numbers of values along "
         "the axes: error; smooth normals on fewer than 48 values a side: warning"),
@@ -157,7 +157,7 @@ SUPPORT = (
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
-        "the curve where they meet, also of separate parts of one mesh"),
+        "the curve where they meet, also of parts of one mesh; in or on an area light, moved against it: warning"),
     Row("cylinders, disks, spheres, curves, SDF grids and ellipsoids that cut into other shapes", "warning",
         "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
