@@ -166,8 +166,10 @@ def thinner_than_lift(scene: mi.Scene, hit, ray: mi.Ray3f, active: mi.Bool) -> m
     facing = dr.dot(si.n, ray.d)
     n = dr.select(facing > 0, -si.n, si.n)
     height = start_height(si.p)
+    lowered = dr.minimum(dr.abs(facing) / LEAST_SLANT, 1)  # of a line that grazes the surface we do not go so far back
     on_line = si.p - ray.d * height / dr.maximum(dr.abs(facing), LEAST_SLANT)
-    return scene.ray_test(mi.Ray3f(on_line, -n, (1 - INSIDE) * height, 0, ray.wavelengths), active)
+    down = mi.Ray3f(on_line, -n, (1 - INSIDE) * height * lowered, 0, ray.wavelengths)
+    return scene.ray_test(down, active & si.is_valid() & (facing != 0))
 
 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:

@@ -136,19 +136,28 @@ def test_material_form_at_contacts_is_named(llvm, height, form, depth, said):
 
 
 @pytest.mark.parametrize(
-    ("centre", "lit", "said"),
-    [((0, 0.2, 0), "still", True), ((0, 0.1, 0), "still", True), ((0, 0.1, 0), "moved", True),
-     ((0, 0.1, 0), None, False), ((0, 0.4, 0), "still", False), ((0, 0.2, 0), "moved", False)],
-)  # fmt: skip
-def test_what_stands_on_a_light_is_named(llvm, centre, lit, said):
-    """A box on, in and above a larger one, of which one shines; what stands on another covers nothing of itself."""
-    shapes = {"still": cube((0, -0.3, 0), (0.3,) * 3), "moved": cube(centre, (0.2,) * 3)}
+    ("height", "lit", "said"),
+    [(0.2, "still", True), (0.1, "still", True), (0.2, "moved", True), (0.1, None, False), (0.4, "still", False)],
+)
+def test_a_light_that_touches_something_is_named(llvm, height, lit, said):
+    """A box on, in and above a larger one, of which one shines. The camera is enough of a motion."""
+    shapes = {"still": cube((0, -0.3, 0), (0.3,) * 3), "moved": cube((0, height, 0), (0.2,) * 3)}
     if lit:
         shapes[lit]["emitter"] = {"type": "area"}
+    assert said == any("area light" in text for text in warned_of(shapes))
+
+
+def test_a_flat_light_on_a_ceiling_may_touch_it(llvm):
+    ceiling, lamp = flat(0, 0.5), flat(0, 0.2)
+    lamp["emitter"] = {"type": "area"}
+    assert not any("area light" in text for text in warned_of({"ceiling": ceiling, "lamp": lamp}))
+
+
+def warned_of(shapes: dict) -> list[str]:
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        edges_of(scene_of(shapes), "moved.vertex_positions", {"direction": AXES["x"]})
-    assert any("area light" in str(w.message) for w in found) == said
+        edges_of(scene_of(shapes), "camera.to_world", {"direction": AXES["x"]})
+    return [str(w.message) for w in found]
 
 
 def test_common_parts_are_counted_once(llvm):
