@@ -55,8 +55,8 @@ def assert_image_of_path(scene: mi.Scene, spec: dict, spp: int) -> None:
 
 
 @pytest.mark.parametrize("options", [
-    dict(),
-    dict(light_paths="only"),
+    pytest.param(dict(), marks=pytest.mark.slow),
+    pytest.param(dict(light_paths="only"), marks=pytest.mark.slow),
     dict(light_paths="only", hide_emitters=True, max_depth=-1, rr_depth=3),
 ], ids=["auto", "only", "only-roulette-hidden"])  # fmt: skip
 def test_image(variant, options):

@@ -73,7 +73,9 @@ def test_rates_that_are_not_finite_are_refused(llvm):
             problem_of([Pose(BOX, rate)])
 
 
-@pytest.mark.parametrize("kind", ["far camera", "bright", "noisy"])
+@pytest.mark.parametrize(
+    "kind", ["far camera", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("bright", "noisy"))]
+)
 def test_honest_runs_are_not_flagged(llvm, kind):
     variable = {
         "far camera": Pose("camera.to_world", 0.05, start_shift=(0.0, 0.0, -20.0)),

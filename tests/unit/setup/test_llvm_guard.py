@@ -24,7 +24,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize("then", [
-    "mi.set_variant('llvm_ad_rgb')",
+    pytest.param("mi.set_variant('llvm_ad_rgb')", marks=pytest.mark.slow),
     "from psdr_jit import scene_io; scene_io.use_variant('llvm_ad_mono')",
 ])  # fmt: skip
 def test_setting_a_variant_says_how_to_get_an_llvm(then):
