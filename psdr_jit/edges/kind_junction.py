@@ -19,6 +19,9 @@ from .points import LEAST_SLANT, ROUNDING_LEAD, clear_of_lift
 from .rows import EdgeRows
 from .wedges import Wedges, meeting_wedges
 
+#: Share of the distance to the viewer that a ray to the side starts before the curve, at most.
+NEAREST = 0.1
+
 
 @dataclass(frozen=True)
 class Junctions(BetweenFaces):
@@ -76,16 +79,19 @@ class Junctions(BetweenFaces):
 
         Along a surface seen at a grazing angle, a step to the side is many times as long, and would lead across the
         thin shadow that begins at the curve. Of a step along a surface with normal n, |n·ω| / |ω × curve| leads to the
-        side; in front is the surface with the larger n·s/(n·ω), s the direction to the side.
+        side; in front is the surface with the larger n·s/(n·ω), s the direction to the side. So much nearer, for a step
+        of 1, the ray has to start: else it begins behind a surface that is seen at a grazing angle.
         """
         n0, n1 = self._normals(row, active)
         s = dr.select(which == 0, -1.0, 1.0) * sight.n_perp
         across = dr.norm(dr.cross(sight.ω, dr.normalize(dr.cross(n0, n1))))
         f0, f1 = dr.dot(n0, sight.ω), dr.dot(n1, sight.ω)
-        in_front = dr.abs(dr.select(dr.dot(n0, s) / f0 > dr.dot(n1, s) / f1, f0, f1))
+        nearer0, nearer1 = dr.dot(n0, s) / f0, dr.dot(n1, s) / f1  # by which a step of 1 to the side meets each
+        in_front = dr.abs(dr.select(nearer0 > nearer1, f0, f1))
         share = dr.select(in_front < across, in_front / across, 1)
         step = sight.offset + share * self._in_the_dark(row, sight.at.x, active)
-        return Side.found_by(mi.Ray3f(sight.at.x + step * s - sight.lead * sight.ω, sight.ω))
+        nearer = dr.clip(step * dr.maximum(nearer0, nearer1), 0, NEAREST * sight.r)
+        return Side.found_by(mi.Ray3f(sight.at.x + step * s - (sight.lead + nearer) * sight.ω, sight.ω))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         index = dr.gather(mi.UInt32, self.index, row, active)

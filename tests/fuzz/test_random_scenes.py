@@ -18,7 +18,8 @@ from psdr_jit.scene.params import find_param
 FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
-FOUND = (461,)  # seeds that were wrong once: a shadow on a mesh, thinner than the height at which rays start
+#: Seeds that were wrong once: a shadow thinner than the height at which rays start; a contact on a face seen edge-on.
+FOUND = (461, 704)
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
