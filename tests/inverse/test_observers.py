@@ -19,6 +19,8 @@ from psdr_jit.core.sensor_frame import look_at, sensor_frame
 from psdr_jit.errors import OptionError, SetupError
 from psdr_jit.inverse import loop, stage
 from psdr_jit.inverse.observer import FRAMES, frame_due
+from psdr_jit.inverse.problem import make_problem
+from psdr_jit.inverse.settings import Settings
 
 STEPS = 4
 
@@ -55,6 +57,35 @@ def test_observers_see_where_the_images_were_taken(llvm):
     count, last = watcher.closed
     assert count == STEPS and np.linalg.norm(last - own) == pytest.approx(result.offsets[BOX]["distance"], rel=0.01)
     assert loop.run(problem_of(iterations=1)).losses == result.losses[:1], "looking on changes nothing"
+
+
+def two_scenes():
+    """The box moves in both, a lamp in the second."""
+    scenes = [scene_of(f"inverse/lamp_{name}", res=8) for name in ("left", "right")]
+    given = [psdr_jit.Stage(scene, target_of(scene, spp=1), name=name)
+             for scene, name in zip(scenes, ("left", "right"), strict=True)]  # fmt: skip
+    variables = [psdr_jit.Pose(BOX, 0.02), psdr_jit.Pose("right:floor.to_world", 0.02)]
+    return make_problem(given, variables, None, "l2", {"type": "psdr_path", "max_depth": 2}, Settings(spp=1))
+
+
+def test_what_moves_in_several_scenes(llvm):
+    problem = two_scenes()
+    assert stage.moving(problem) == {"left_blocker", "right_blocker", "right_floor"}
+    bodies = stage.bodies(problem)
+    assert stage.moving(problem) < set(bodies) and "left_floor" in bodies
+    assert bodies["left_blocker"] is not bodies["right_blocker"]
+
+
+@pytest.mark.slow
+def test_a_recording_holds_every_scene(llvm, tmp_path):
+    pytest.importorskip("rerun", reason="the package rerun-sdk is not installed")
+    view = psdr_jit.LiveView(tmp_path / "run.rrd")
+    view.begin(two_scenes())
+    view.close(1)
+    rows = chunks(tmp_path / "run.rrd")
+    shapes = {name: rows.get(f"world/shapes/{name}") for name in ("left_blocker", "right_blocker", "left_floor")}
+    assert shapes == {"left_blocker": 1, "right_blocker": 1, "left_floor": 1}
+    assert rows["world/cameras/left_camera"] == rows["world/cameras/right_camera"] == 1
 
 
 @pytest.mark.parametrize("make, missing, extra", [(psdr_jit.LiveView, "rerun", "rerun"),
