@@ -1,7 +1,8 @@
 """Putting the value of a parameter into the tree of a scene file: what each kind of it is called there.
 
 Most are called the same. Exceptions: poses replace the ways to say them (centre, radius, end points); an index of
-refraction is a ratio of two; the horizontal angle of view; meshes, pictures, grids and curves are files.
+refraction is a ratio of two; sizes of a film are two numbers; the horizontal angle of view; meshes, pictures, grids and
+curves are files.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ PARTS = ("vertex_", "face_", "faces")
 #: Materials whose index of refraction is given as a ratio.
 DIELECTRICS = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic", "psdr_dielectric",
                "psdr_plastic")  # fmt: skip
+
+#: Of a film: what the file calls the two numbers of a parameter.
+FILM = {"size": ("width", "height"), "crop_size": ("crop_width", "crop_height"),
+        "crop_offset": ("crop_offset_x", "crop_offset_y")}  # fmt: skip
 
 #: Index of refraction and absorption of a metal: the name of a material stands for both.
 CONDUCTOR = ("eta", "k")
@@ -101,6 +106,9 @@ def _same_name(place: Node, name: str, last: str, value: Any) -> None:
         place.entries[last] = value
         return
     numbers = _flat(value) if not is_transform(value) else np.empty(0)
+    if place.tag == "film" and last in FILM:
+        place.entries |= {key: int(number) for key, number in zip(FILM[last], numbers, strict=True)}
+        return
     before = place.entries.get(last)
     if isinstance(before, Vector) and numbers.size == 3:
         place.entries[last] = Vector(tuple(map(float, numbers)))

@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 
 from psdr_jit.core import files
-from psdr_jit.derivative.images import srgb
+from psdr_jit.derivative.images import check_writable, srgb
 from psdr_jit.errors import OptionError, SetupError
 from psdr_jit.inverse.observer import Care, Seen, curves, frame_due
 
 
 class EventFiles:
-    """An observer that adds an event file to `folder`. Raises `SetupError` where the package is missing."""
+    """An observer that adds an event file to `folder` once a run begins: one that cannot begin leaves none.
+
+    Raises `SetupError` where the package is missing.
+    """
 
     def __init__(self, folder: str | os.PathLike) -> None:
         try:
@@ -33,14 +36,20 @@ class EventFiles:
             raise OptionError(f"--tensorboard {folder}: that is a file; name a folder")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._writer = SummaryWriter(str(folder))
         except OSError as error:
             raise files.refusal(folder, error) from error
+        check_writable(folder / "events")
+        self._folder, self._make = folder, SummaryWriter
         self._care = Care(f"'{folder}'")
+        self._writer: Any = None
         self._problem: Any = None
 
     def begin(self, problem: Any) -> None:
         self._problem = problem
+        try:
+            self._writer = self._make(str(self._folder))
+        except OSError as error:
+            raise files.refusal(self._folder, error) from error
         for view in problem.views:
             self._care.attempt(lambda view=view: self._image(f"{view.name}/target", np.array(view.target), 0))
 
@@ -48,6 +57,8 @@ class EventFiles:
         self._care.attempt(lambda: self._step(seen))
 
     def close(self, iteration: int) -> None:
+        if self._writer is None:
+            return
         self._care.attempt(self._writer.close)
 
     def _step(self, seen: Seen) -> None:

@@ -13,7 +13,8 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +77,32 @@ class Journal:
         for observer in self._observers:
             observer.begin(problem)
 
-    def close(self, iteration: int = 0) -> None:
-        """Close the log; one that has nothing in it is removed. Observers take a last look."""
-        for observer in self._observers:
-            observer.close(iteration)
+    @contextmanager
+    def closed_after(self, state: Any) -> Iterator[None]:
+        """Close when a run of `state` ends, however it does."""
+        try:
+            yield
+        except BaseException as error:
+            self.close(state.iteration, error)
+            raise
+        self.close(state.iteration)
+
+    def close(self, iteration: int = 0, first: BaseException | None = None) -> None:
+        """Close the log, then let every observer take a last look; they may be anyone's, and may raise anything.
+
+        Raises `first` if that is why the run ends: it is not to be hidden by what an observer then raises.
+        """
+        try:
+            with ExitStack() as after:
+                for observer in reversed(self._observers):
+                    after.callback(observer.close, iteration)
+                self._close_log()
+        finally:
+            if first is not None:
+                raise first
+
+    def _close_log(self) -> None:
+        """One that has nothing in it is removed."""
         if self._log is None:
             return
         self._try("log.jsonl", self._log.close)

@@ -3,7 +3,7 @@
 Needs the package `rerun-sdk`. What is logged, on the timeline `iteration`:
 
     loss, learning_rate, gradient_norm/..., offset/..., value/...     curves, see `observer.curves`
-    world/shapes/NAME        meshes, boxes around other shapes; anew where a variable moves them
+    world/shapes/NAME        meshes, boxes around other shapes; anew where a variable moves them; SCENE_NAME of several
     world/cameras/VIEW       pose, and the image as the loss has seen it
     targets/VIEW             what it should become
 
@@ -89,7 +89,7 @@ class LiveView:
         rr, problem = self._rr, self._problem
         for view in problem.views:
             self._image(["targets", view.name], np.array(view.target), static=True)
-        for name, shape in stage.shapes(problem.scene).items():
+        for name, shape in stage.bodies(problem).items():
             if name not in self._moving:
                 self._shape(name, shape, static=True)
         for view in problem.views:
@@ -112,7 +112,7 @@ class LiveView:
         self._log.flush()
 
     def _move(self) -> None:
-        for name, shape in stage.shapes(self._problem.scene).items():
+        for name, shape in stage.bodies(self._problem).items():
             if name in self._moving:
                 self._shape(name, shape)
         for view in self._problem.views:
@@ -132,7 +132,7 @@ class LiveView:
         rr, found = self._rr, stage.camera(view.sensor)
         parts = [rr.Transform3D(translation=found.pose[:3, 3], mat3x3=found.pose[:3, :3])]
         if found.intrinsics is not None:
-            bbox = self._problem.scene.bbox()
+            bbox = self._problem.parts[view.part].scene.bbox()
             parts.append(rr.Pinhole(
                 image_from_camera=found.intrinsics, resolution=found.size, camera_xyz=rr.ViewCoordinates.LUF,
                 image_plane_distance=PLANE * float(np.linalg.norm(np.array(bbox.extents()))),

@@ -94,27 +94,26 @@ def _run(problem: Problem, folder: Path | None, resume: bool, progress: Any, obs
         _restore(problem, state, checkpoints.load(folder / checkpoints.NAME, problem.fingerprint))
     journal = Journal(folder, problem, keep=state.iteration, observers=observers)
     losses: list[float] = []
-    try:
-        journal.picture(problem, problem.start())
-        journal.begin(problem)
-        with warnings.catch_warnings():
-            # said once it has lasted, with the variable's name; entered once, or "once" would mean every iteration
-            warnings.simplefilter("ignore", ZeroDerivativeWarning)
-            status = _loop(problem, state, journal, losses, progress)
-        if status != DIVERGED:
-            journal.keep(_checkpoint(problem, state), last=status == INTERRUPTED)
-        found = copied(state.history.best if status == DIVERGED else state.latents)
-        problem.apply(found)
-        start = problem.offsets(problem.start())
-        result = Result(status, state.iteration, state.clock(), losses, state.history.mean, found,
-                        problem.offsets(found), start)  # fmt: skip
-        if status != INTERRUPTED:
-            journal.finish(problem, result)
-    except ClusterError:  # nothing has been stepped since
-        journal.keep(_checkpoint(problem, state))
-        raise
-    finally:
-        journal.close(state.iteration)
+    with journal.closed_after(state):
+        try:
+            journal.picture(problem, problem.start())
+            journal.begin(problem)
+            with warnings.catch_warnings():
+                # said once it has lasted, with the variable's name; entered once, or "once" would mean every iteration
+                warnings.simplefilter("ignore", ZeroDerivativeWarning)
+                status = _loop(problem, state, journal, losses, progress)
+            if status != DIVERGED:
+                journal.keep(_checkpoint(problem, state), last=status == INTERRUPTED)
+            found = copied(state.history.best if status == DIVERGED else state.latents)
+            problem.apply(found)
+            start = problem.offsets(problem.start())
+            result = Result(status, state.iteration, state.clock(), losses, state.history.mean, found,
+                            problem.offsets(found), start)  # fmt: skip
+            if status != INTERRUPTED:
+                journal.finish(problem, result)
+        except ClusterError:  # nothing has been stepped since
+            journal.keep(_checkpoint(problem, state))
+            raise
     result.not_written, result.lost, result.folder = journal.not_written, journal.lost, folder
     return result
 

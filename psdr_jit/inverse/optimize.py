@@ -70,6 +70,8 @@ def optimize(
     if not isinstance(scene, Sequence):
         source = SceneFile(source) if isinstance(source, str) else source
         scene, targets = [Stage(scene, targets, source=source)], None
+    elif source is not None:
+        raise OptionError("source: several scenes have a file each: give each psdr_jit.Stage its source, none beside")
     problem = make_problem(scene, variables, targets, loss, integrator, Settings(**settings))
     if client is not None:
         problem = with_crew(problem, client, integrator)

@@ -69,11 +69,20 @@ def camera(sensor: mi.Sensor) -> Camera:
     return Camera(pose, (width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 
+def bodies(problem: Any) -> dict[str, mi.Shape]:
+    """Shapes of all scenes of a problem. Of several scenes, each name begins with that of its scene, as views' do."""
+    return {part.label(name): shape for part in problem.parts for name, shape in shapes(part.scene).items()}
+
+
 def moving(problem: Any) -> set[str]:
-    """Names of shapes that own a variable, and of views whose sensors do."""
-    owners = [problem.params.properties[name][2] for name in problem.variables]
-    found = {name for name, shape in shapes(problem.scene).items() if any(_same(shape, owner) for owner in owners)}
-    return found | {view.name for view in problem.views if any(_same(view.sensor, owner) for owner in owners)}
+    """Names, as in `bodies`, of shapes that a variable acts on, and of views whose sensors one acts on."""
+    found: set[str] = set()
+    for k, part in enumerate(problem.parts):
+        owners = [part.params.properties[variable.parameter][2] for variable in part.variables.values()]
+        own = {part.label(name): shape for name, shape in shapes(part.scene).items()}
+        own |= {view.name: view.sensor for view in problem.views if view.part == k}
+        found |= {name for name, thing in own.items() if any(_same(thing, owner) for owner in owners)}
+    return found
 
 
 def _same(one: Any, other: Any) -> bool:

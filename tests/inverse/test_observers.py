@@ -16,9 +16,12 @@ from inverse_problems import BOX, box_and_lamp, problem_of, scene_of, target_of,
 import psdr_jit
 from psdr_jit.cli.main import main
 from psdr_jit.core.sensor_frame import look_at, sensor_frame
-from psdr_jit.errors import OptionError, SetupError
+from psdr_jit.errors import OptionError, PsdrError, SetupError
 from psdr_jit.inverse import loop, stage
+from psdr_jit.inverse.journal import Journal
 from psdr_jit.inverse.observer import FRAMES, frame_due
+from psdr_jit.inverse.problem import make_problem
+from psdr_jit.inverse.settings import Settings
 
 STEPS = 4
 
@@ -55,6 +58,72 @@ def test_observers_see_where_the_images_were_taken(llvm):
     count, last = watcher.closed
     assert count == STEPS and np.linalg.norm(last - own) == pytest.approx(result.offsets[BOX]["distance"], rel=0.01)
     assert loop.run(problem_of(iterations=1)).losses == result.losses[:1], "looking on changes nothing"
+
+
+class Rude(Watcher):
+    """Fails when it is to close, and notes whether the log is closed by then."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def begin(self, problem) -> None:
+        raise PsdrError("the first error")
+
+    def close(self, iteration: int) -> None:
+        self.closed = not (self.folder / "log.jsonl").exists()  # an empty one is removed when it is closed
+        raise KeyError("rude")
+
+
+def test_an_observer_that_fails_to_close_hides_nothing(llvm, tmp_path):
+    """The log is closed, the others take their last look, and the error of the run is what is raised."""
+    scene = scene_of()
+    problem = make_problem(scene, box_and_lamp(), target_of(scene, spp=1), "l2", None, Settings(iterations=1, spp=1))
+    rude, second = Rude(tmp_path), Watcher()
+    second.begin(problem)
+    with pytest.raises(KeyError, match="rude"):
+        Journal(tmp_path, problem, 0, [rude, second]).close()
+    assert rude.closed and second.closed[0] == 0
+    second.closed = None
+    with pytest.raises(PsdrError, match="the first error"):
+        loop.run(problem, observers=[rude, second])
+    assert second.closed[0] == 0
+
+
+def two_scenes():
+    """The box moves in both, a lamp in the second."""
+    scenes = [scene_of(f"inverse/lamp_{name}", res=8) for name in ("left", "right")]
+    given = [psdr_jit.Stage(scene, target_of(scene, spp=1), name=name)
+             for scene, name in zip(scenes, ("left", "right"), strict=True)]  # fmt: skip
+    variables = [psdr_jit.Pose(BOX, 0.02), psdr_jit.Pose("right:floor.to_world", 0.02)]
+    return make_problem(given, variables, None, "l2", {"type": "psdr_path", "max_depth": 2}, Settings(spp=1))
+
+
+def test_what_moves_in_several_scenes(llvm):
+    problem = two_scenes()
+    assert stage.moving(problem) == {"left_blocker", "right_blocker", "right_floor"}
+    bodies = stage.bodies(problem)
+    assert stage.moving(problem) < set(bodies) and "left_floor" in bodies
+    assert bodies["left_blocker"] is not bodies["right_blocker"]
+
+
+@pytest.mark.slow
+def test_a_recording_holds_every_scene(llvm, tmp_path):
+    pytest.importorskip("rerun", reason="the package rerun-sdk is not installed")
+    view = psdr_jit.LiveView(tmp_path / "run.rrd")
+    view.begin(two_scenes())
+    view.close(1)
+    rows = chunks(tmp_path / "run.rrd")
+    shapes = {name: rows.get(f"world/shapes/{name}") for name in ("left_blocker", "right_blocker", "left_floor")}
+    assert shapes == {"left_blocker": 1, "right_blocker": 1, "left_floor": 1}
+    assert rows["world/cameras/left_camera"] == rows["world/cameras/right_camera"] == 1
+
+
+def test_a_run_that_cannot_begin_leaves_no_event_file(llvm, tmp_path):
+    pytest.importorskip("tensorboardX", reason="the package tensorboardX is not installed")
+    config, logs = write_config(tmp_path, **{"blocker.vertex_positions": "blocker.vertex_position"}), tmp_path / "logs"
+    assert main(["optimize", str(config), "--out", str(tmp_path / "out"), "--tensorboard", str(logs)]) == 2
+    assert not list(logs.iterdir())
 
 
 @pytest.mark.parametrize("make, missing, extra", [(psdr_jit.LiveView, "rerun", "rerun"),

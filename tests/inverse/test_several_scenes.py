@@ -151,6 +151,8 @@ def test_what_is_wrong_is_said_before_it_runs(llvm):
     ):
         with pytest.raises(OptionError, match=words):
             wrong()
+    with pytest.raises(OptionError, match="give each psdr_jit.Stage its source"):
+        psdr_jit.optimize([one, other], box, source=FILES["left"], iterations=1, spp=1)
     with pytest.raises(ParameterError, match="no parameter 'boxx.vertex_positions'"):
         problem([one, other], Pose("boxx.vertex_positions", 0.02))
     with pytest.raises(ParameterError, match=r"not the same in all scenes.*'SCENE:floor"):

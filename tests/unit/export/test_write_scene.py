@@ -114,6 +114,27 @@ def test_what_no_file_can_say_is_an_error_and_leaves_none(llvm, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["point_shadow.xml", "camera_crop.xml"])
+def test_a_film_of_another_size_than_the_file_says(llvm, tmp_path, name):
+    """As when a scene is loaded with a `res` that `source` does not name."""
+    path = str(scene_io.shipped_scene(name))
+    scene = scene_io.load_scene(path, res=52)  # with room for the crop
+    film, own = (s.sensors()[0].film() for s in (written(scene, tmp_path / "now.xml", path), scene))
+    assert film.size()[0] == 52 != scene_io.load_scene(path).sensors()[0].film().size()[0]
+    for size in ("size", "crop_size", "crop_offset"):
+        assert [*getattr(film, size)()] == [*getattr(own, size)()], size
+
+
+def test_a_crop_that_the_file_does_not_have(llvm, tmp_path):
+    path = str(scene_io.shipped_scene("point_shadow.xml"))
+    scene = scene_io.load_scene(path)
+    params = traverse(scene)
+    params["camera.film.crop_size"], params["camera.film.crop_offset"] = [7, 5], [2, 3]
+    params.update()
+    film = written(scene, tmp_path / "now.xml", path).sensors()[0].film()
+    assert ([*film.crop_size()], [*film.crop_offset()]) == ([7, 5], [2, 3])
+
+
 def test_a_value_that_reading_changes_is_an_error(llvm, tmp_path):
     source = SceneFile(str(scene_io.shipped_scene("point_shadow.xml")), {"res": 8})
     scene = scene_io.load_scene(source.path, **source.defaults)
