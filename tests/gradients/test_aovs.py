@@ -122,6 +122,7 @@ def test_a_gradient_has_them_too(llvm):
     spec = spec_of("dd:depth", sppc=64, sppp=64)
     found = psdr_jit.gradient(scene, BOX, (1, 0, 0), integrator=spec, spp=64, seeds=4)
     assert found.total.shape == (16, 16, 4) and found.primal.shape == (16, 16, 4)
+    assert found.aovs == ["dd.T"] == integrator_specs.aovs_of(integrator_specs.build(spec))
     assert np.abs(found.terms["primary"][..., 3]).max() > 10 * np.abs(found.terms["primary"][..., :3]).max()
 
 
