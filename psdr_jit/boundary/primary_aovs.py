@@ -1,7 +1,9 @@
 """Steps of AOVs along the edges that the sensor sees directly: `primary` with another integrand.
 
 The derivative of the image receives (A_− − A_+) · s·(v_B − u) · |dx/dt × ω| / J_px / pdf(t), where A_∓ is the AOV of
-what lies on the side −s and +s of the edge; 0 of nothing.
+what lies on the side −s and +s of the edge; 0 of nothing. Lines inside a surface at which only what it sends steps,
+those of patterns and of shading normals, are left out: no AOV steps there, but each would differ by the distance of
+the two points at which the sides are looked at.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
 from ..edges.table import look_beside
 from ..paths.aovs import Aovs
+from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 from . import primary
 
@@ -24,7 +27,7 @@ def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.Ed
     which, s = index & 1, dr.gather(primary.EdgeSample, sample, index >> 1)
     seen = primary.seen_edge(job, edges, s)
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, dr.zeros(mi.Color0f))
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All, differs)
+    si = surface_at(job.tubes, pi, ray, mi.RayFlags.All, differs)
     values = [dr.select(differs, value, 0) for value in aovs.values(si, seen.view.o)]
     dr.eval(values)
     even = 2 * dr.arange(mi.UInt32, n)
@@ -33,7 +36,7 @@ def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.Ed
 
 def _steps(job: Job, aovs: Aovs) -> tuple[primary.PrimaryEdges, primary.Steps, list[mi.Float]] | None:
     """Samples, and their contributions per unit of motion by channel; None if there are none."""
-    edges = primary.primary_edges(job)
+    edges = primary.primary_edges(job, shades_only=False)
     sample = None if edges is None else primary.sample_visible(job, edges)
     if sample is None:
         return None

@@ -77,7 +77,7 @@ def show_gradient(args: argparse.Namespace, scene: Any, out: Path) -> None:
               ("derivative", "finite differences: everything", reference.mean)]
     png = images.write_panels(out / "gradient.png", panels)
     layers = {**result.layers(), "finite_differences": reference.mean}
-    exr = images.write_exr(out / "gradient.exr", layers, result.metadata())
+    exr = images.write_exr(out / "gradient.exr", layers, result.metadata(), result.aovs)
     print(f"1. Derivative of the image as the small box moves along x\n"
           f"   derivative         {result.seconds:5.1f} s, {result.seeds} seeds x {result.spp} spp\n"
           f"   finite differences {reference.seconds:5.1f} s, eps {reference.eps:.3g}\n"

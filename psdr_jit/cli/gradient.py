@@ -81,7 +81,7 @@ def write(args: argparse.Namespace, result: Any, exr: Path, png: Path) -> None:
     """The files, and what is in them."""
     from psdr_jit.derivative import images
 
-    images.write_exr(exr, result.layers(), result.metadata())
+    images.write_exr(exr, result.layers(), result.metadata(), result.aovs)
     title = f"d image / d {result.param}\n{result.direction}"
     images.write_derivative_png(png, result.total, title)
     if not args.quiet:

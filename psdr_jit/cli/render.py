@@ -39,12 +39,12 @@ def run(args: argparse.Namespace) -> int:
     import mitsuba as mi
 
     from psdr_jit.core.film import require_samples
-    from psdr_jit.derivative.integrator_specs import to_image
+    from psdr_jit.derivative.integrator_specs import aovs_of, to_image
 
     require_samples(scene.sensors()[args.sensor], args.spp or 0)
     image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))
     if output.suffix.lower() == ".exr":
-        images.write_exr(output, {"primal": image})
+        images.write_exr(output, {"primal": image}, aovs=aovs_of(scene.integrator()))
     else:
         images.write_panels(output, [("primal", Path(args.scene).name, image)])
     if not args.quiet:

@@ -22,6 +22,7 @@ from psdr_jit.derivative.sampler import PRIMAL, TOTAL, DerivativeSampler, Terms
 from psdr_jit.derivative.statistics import GroupedImages
 from psdr_jit.errors import OptionError
 from psdr_jit.options import require_count
+from psdr_jit.paths.aovs import Aovs
 from psdr_jit.scene.io import find_sensor
 
 __all__ = ["DerivativeSampler", "GradientResult", "gradient"]  # the first has its place in `sampler`
@@ -53,6 +54,11 @@ class GradientResult:
             named[term] = image
             named[f"{term}_stderr"] = self.term_stderr[term]
         return named
+
+    @property
+    def aovs(self) -> list[str]:
+        """Names of the last channels, those that are no colours."""
+        return Aovs.parse(self.integrator.get("aovs", "")).channels
 
     def __repr__(self) -> str:
         """One line a term instead of the arrays."""

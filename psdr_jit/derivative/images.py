@@ -43,11 +43,12 @@ def check_writable(path: str | os.PathLike) -> Path:
 
 
 def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray],
-              metadata: Mapping[str, str] | None = None) -> Path:
+              metadata: Mapping[str, str] | None = None, aovs: Sequence[str] = ()) -> Path:
     """Write images (H, W, C) as layers of one 32-bit float OpenEXR file.
 
     The first layer is also the default one (plain R, G, B), so that every viewer shows something. Layer
     `total` has the channels `total.R`, `total.G`, `total.B`. `metadata` goes into the header.
+    `aovs`: names of the last channels of every layer, as `dd.T`; they become `total.dd.T`.
     """
     import OpenEXR
 
@@ -56,7 +57,7 @@ def write_exr(path: str | os.PathLike, layers: Mapping[str, np.ndarray],
     channels: dict[str, np.ndarray] = {}
     for k, (name, image) in enumerate(layers.items()):
         for prefix in ("", f"{name}.") if k == 0 else (f"{name}.",):
-            channels.update(_channels(prefix, image))
+            channels.update(_channels(prefix, image, aovs))
     sizes = {c.shape for c in channels.values()}
     if len(sizes) > 1:
         raise OptionError(f"the layers of an image must have one size, got {sorted(sizes)}")
@@ -81,10 +82,16 @@ def _require_whole(path: str, channels: Mapping[str, np.ndarray]) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _channels(prefix: str, image: np.ndarray) -> dict[str, np.ndarray]:
+def channel_names(count: int, aovs: Sequence[str] = ()) -> tuple[str, ...]:
+    """Names of `count` channels, of which the last are `aovs`: what is no colour must not pass for alpha."""
+    count -= len(aovs)
+    return (*CHANNELS.get(count, ("R", "G", "B", *(f"C{k}" for k in range(3, count)))), *aovs)
+
+
+def _channels(prefix: str, image: np.ndarray, aovs: Sequence[str]) -> dict[str, np.ndarray]:
     image = np.asarray(image, dtype=np.float32)
     image = image if image.ndim == 3 else image[..., None]
-    names = CHANNELS.get(image.shape[-1], ("R", "G", "B", *(f"C{k}" for k in range(3, image.shape[-1]))))
+    names = channel_names(image.shape[-1], aovs)
     return {prefix + c: np.ascontiguousarray(image[..., k]) for k, c in enumerate(names)}
 
 

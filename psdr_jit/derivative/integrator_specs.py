@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.driver.aovs import AovChannels
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
 from psdr_jit.options import FOLLOWS
@@ -138,6 +139,12 @@ def to_image(tensor: Any) -> np.ndarray:
     """A rendered tensor as a float64 array (H, W, C)."""
     image = np.array(tensor, dtype=np.float64)
     return image if image.ndim == 3 else image[..., None]
+
+
+def aovs_of(integrator: Any) -> list[str]:
+    """Names of the channels that one of our integrators renders behind those of the film, as `dd.T`."""
+    own = getattr(integrator, "aovs", None)
+    return own.aovs.channels if isinstance(own, AovChannels) else []
 
 
 def _last_line(error: Exception) -> str:

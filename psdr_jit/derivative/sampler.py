@@ -111,6 +111,8 @@ def _samplers(param: Perturbation, integrator: Any, sensor: Any, spp: int) -> tu
     """One sampler for each term (or one named `TOTAL`), the integrator of the primal image, and the spec."""
     if hasattr(integrator, "render_forward"):
         spec = {"type": str(integrator).split("[")[0], **integrator_specs.path_options(integrator)}
+        if integrator_specs.aovs_of(integrator):
+            spec["aovs"] = integrator.options.aovs
         return {TOTAL: DerivativeSampler(param, integrator, sensor, spp)}, integrator, spec
     spec = integrator_specs.integrator_spec(param.scene, integrator)
     whole = differentiable(spec)

@@ -81,6 +81,7 @@ class PatternLines(FixedKind):
     """Rows of a `PatternSet`; subclasses know the surface."""
 
     blocks_light: ClassVar[bool] = False
+    shades_only: ClassVar[bool] = True
 
     lines: PatternSet
     moves: mi.Bool  # by row

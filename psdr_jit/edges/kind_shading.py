@@ -45,6 +45,7 @@ class ShadingOutlines(EdgeKind):
     """One row per face; most of them are crossed by no curve."""
 
     blocks_light: ClassVar[bool] = False
+    shades_only: ClassVar[bool] = True
 
     faces: SmoothFaces
     centre: mi.Point3f  # of the scene

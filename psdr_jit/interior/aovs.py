@@ -1,4 +1,4 @@
-"""What changes of AOVs along fixed viewing rays: Mitsuba's own derivative of what a ray meets, ∫ f ∂A/∂θ dx."""
+"""What changes of AOVs along fixed viewing rays: ∫ f ∂A/∂θ dx, with the surface that a ray meets attached."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import mitsuba as mi
 from ..core import film as films
 from ..core.ad import backpropagate, tangents
 from ..paths.aovs import Aovs
+from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 from .term import camera_passes
 
@@ -18,7 +19,8 @@ def _images(job: Job, aovs: Aovs) -> Iterator[mi.TensorXf]:
     """Images (H, W, K) of passes, attached to the scene's parameters; their sum is the image."""
     for p in camera_passes(job):
         with dr.resume_grad():
-            si = job.scene.ray_intersect(p.ray, mi.RayFlags.All, coherent=True)
+            pi = job.scene.ray_intersect_preliminary(p.ray, coherent=True)
+            si = surface_at(job.tubes, pi, p.ray, mi.RayFlags.All)
             values = [value * p.share for value in aovs.values(si, p.ray.o)]
             yield films.develop_channels(job.film, aovs.channels, p.at, values)
 

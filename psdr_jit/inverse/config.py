@@ -263,7 +263,7 @@ def _stage(config: Config, k: int, table: SceneTable, send: bool) -> Stage:
     """One scene with its targets, which are rendered as the file says."""
     scene = scene_io.load_scene(table.file, **table.defaults)
     integrator_specs.build(integrator_specs.integrator_spec(scene, config.integrator))  # raises before rendering
-    kept = {key: value for key, value in config.integrator.items() if key in integrator_specs.PATH_OPTIONS}
+    kept = {key: value for key, value in config.integrator.items() if key in (*integrator_specs.PATH_OPTIONS, "aovs")}
     spec = integrator_specs.integrator_spec(scene, kept | {"type": integrator_specs.DEFAULT_INTEGRATOR})
     path = integrator_specs.build(spec)
     targets: dict[int, Any] = {}

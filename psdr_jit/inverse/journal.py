@@ -149,12 +149,12 @@ class Journal:
         for k, image in found.items():
             view = problem.views[k]
             layers |= {f"image_{view.name}": image, f"target_{view.name}": np.array(view.target)}
-        sizes = {layer.shape[:2] for layer in layers.values()}
+        sizes, aovs = {layer.shape[:2] for layer in layers.values()}, problem.views[0].aovs
         if len(sizes) == 1:  # a file has one size
             path = self.folder / "snapshots" / f"{iteration:06d}.exr" if self.folder else None
-            self._try("snapshots", lambda: images.write_exr(path, layers, {"iteration": str(iteration)}))
+            self._try("snapshots", lambda: images.write_exr(path, layers, {"iteration": str(iteration)}, aovs))
         else:
-            self._try("snapshots", lambda: _write_each(self.folder / "snapshots", iteration, layers))
+            self._try("snapshots", lambda: _write_each(self.folder / "snapshots", iteration, layers, aovs))
 
     def picture(self, problem: Any, latents: Any) -> None:
         """Remember what the first views see now; the scene is left at `latents`."""
@@ -171,7 +171,7 @@ class Journal:
         self._scene(problem)
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
-        self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows))
+        self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows, problem.views[0].aovs))
         self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
 
@@ -228,16 +228,16 @@ def _look(problem: Any, view: Any) -> np.ndarray:
         return np.array(part.integrator.render(part.scene, view.sensor, seed=SEED, spp=STRIP_SPP))
 
 
-def _write_views(folder: Path, rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]) -> None:
+def _write_views(folder: Path, rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]], aovs: Sequence[str]) -> None:
     folder.mkdir(exist_ok=True)
     for name, initial, final, target in rows:
         layers = {"initial": initial, "final": final, "target": target}
-        images.write_exr(folder / (re.sub(r"[^\w.-]", "_", name) + ".exr"), layers)
+        images.write_exr(folder / (re.sub(r"[^\w.-]", "_", name) + ".exr"), layers, aovs=aovs)
 
 
-def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray]) -> None:
+def _write_each(folder: Path, iteration: int, layers: dict[str, np.ndarray], aovs: Sequence[str]) -> None:
     for name, layer in layers.items():
-        images.write_exr(folder / f"{iteration:06d}_{name}.exr", {name: layer})
+        images.write_exr(folder / f"{iteration:06d}_{name}.exr", {name: layer}, aovs=aovs)
 
 
 def _values(problem: Any) -> dict[str, bytes]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from psdr_jit.core.film import require_samples
 from psdr_jit.core.upload import in_memory
+from psdr_jit.derivative.integrator_specs import aovs_of
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse.losses import Loss, find_loss
 from psdr_jit.inverse.parts import Part, Stage, begun, parts_of
@@ -233,7 +234,7 @@ def _stages(scene: Any, targets: Any) -> list[Stage]:
 
 def _views(k: int, stage: Stage, part: Part) -> list[View]:
     """Views of a scene; its loss is their mean."""
-    found = views(stage.scene, stage.targets)
+    found = views(stage.scene, stage.targets, aovs_of(part.integrator))
     return [replace(view, part=k, share=stage.weight / len(found), name=part.label(view.name)) for view in found]
 
 

@@ -112,7 +112,11 @@ def _layers(path: Path) -> dict[str, np.ndarray]:
     for name, plane in channels.items():
         layer, _, channel = name.rpartition(".")
         grouped.setdefault(layer, {})[channel] = plane
-    named = {layer: planes for layer, planes in grouped.items() if layer} or {PRIMAL: grouped.get("", {})}
+    # Channels beside the colours of a layer, as total.dd.T, and those of the default one, as dd.T
+    beside = {layer for layer in grouped if layer.rpartition(".")[0] in grouped and "." in layer}
+    beside |= {layer.rpartition(".")[2] for layer in beside}
+    named = {layer: planes for layer, planes in grouped.items() if layer and layer not in beside}
+    named = named or {PRIMAL: grouped.get("", {})}
     found = {layer: _stacked(planes) for layer, planes in named.items() if planes}
     if not found:
         raise OptionError(f"'{path}' has no channels: there is nothing to show")

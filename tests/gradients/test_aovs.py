@@ -38,6 +38,9 @@ def spec_of(aovs: str, **options) -> dict:
     ("sunk_box", "box.vertex_positions", {"direction": (1, 0, 0)}, 0.005, ""),  # it cuts into the floor
     ("sphere_silhouette", "ball.to_world", {"direction": (1, 0, 0)}, 0.002, ""),
     ("smooth_mesh", "ball.vertex_positions", {"direction": (1, 0, 0)}, 0.002, ""),
+    ("rod_shadow", "blocker.control_points", {"direction": (1, 0, 0)}, 0.003, ""),
+    ("curve_shadow", "blocker.control_points", {"direction": (1, 0, 0)}, 0.003, ""),
+    ("ellipsoids_shadow", "blocker.data", {"index": 1}, 0.003, ""),
     ("camera_perspective", "camera.to_world", {"rotate": (0, 1, 0)}, 0.002, ""),
     ("camera_perspective", "camera.to_world", {"direction": (1, 0, 0)}, 0.005, ""),
 ])  # fmt: skip
@@ -53,6 +56,25 @@ def test_against_finite_differences(llvm, name, parameter, how, eps, more):
         assert abs(found.value - 1) < TOLERANCE + 3 * stderr, f"{channel}: gain {found.value:.4f} +- {stderr:.4f}"
         for wrong in (0, -1, 0.5):
             assert abs(wrong * found.value - 1) > TOLERANCE + 5 * stderr, "the test could not fail"
+
+
+@pytest.mark.slow
+def test_a_pattern_is_no_step(llvm):
+    """A camera over a floor with a hundred lines: where it looks moves as it does, everywhere."""
+    squares = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([50, 50, 1])}
+    pose = mi.ScalarTransform4f().look_at(origin=(0.01, 0.02, 3), target=(0.01, 0.02, 0), up=(0, 1, 0))
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    scene = mi.load_dict({
+        "type": "scene",
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": squares}},
+        "camera": {"type": "perspective", "fov": 30, "to_world": pose, "film": film},
+        "lamp": {"type": "point", "position": (0, 0, 4)},
+    })  # fmt: skip
+    found = forward(perturb(scene, "camera.to_world", (1, 0, 0)), spec_of("pp:position", max_depth=2), 4, 64).mean(0)
+    x, y, z = (found[..., k] for k in (-3, -2, -1))
+    assert np.abs(found[..., :3]).max() > 0.01, "radiance steps at the lines"
+    assert abs(x.mean() - 1) < 1e-4 and np.abs(x - 1).max() < 1e-3
+    assert np.abs(y).max() < 1e-3 and np.abs(z).max() < 1e-3
 
 
 @pytest.mark.slow
@@ -100,6 +122,7 @@ def test_a_gradient_has_them_too(llvm):
     spec = spec_of("dd:depth", sppc=64, sppp=64)
     found = psdr_jit.gradient(scene, BOX, (1, 0, 0), integrator=spec, spp=64, seeds=4)
     assert found.total.shape == (16, 16, 4) and found.primal.shape == (16, 16, 4)
+    assert found.aovs == ["dd.T"] == integrator_specs.aovs_of(integrator_specs.build(spec))
     assert np.abs(found.terms["primary"][..., 3]).max() > 10 * np.abs(found.terms["primary"][..., :3]).max()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
@@ -13,6 +14,8 @@ from psdr_jit.cli import main
 from psdr_jit.derivative import images
 from psdr_jit.errors import OptionError, ParameterError
 from psdr_jit.inverse import config
+from psdr_jit.inverse.problem import make_problem
+from psdr_jit.inverse.settings import Settings
 from psdr_jit.inverse.targets import read_image
 
 
@@ -108,6 +111,26 @@ def test_target_files_are_read_as_linear_radiance(llvm, tmp_path):
     image = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
     images.write_exr(tmp_path / "target.exr", {"image": image})
     assert np.allclose(np.array(read_image(tmp_path / "target.exr"))[..., :3], image)
+
+
+def test_targets_with_aovs(llvm, tmp_path):
+    """They have the channels of the integrator, by name: a file's alpha is no depth."""
+    scene, integrator = scene_of(), {"type": "psdr_path", "max_depth": 2, "aovs": "dd:depth"}
+    image = np.random.default_rng(0).random((16, 16, 4)).astype(np.float32)
+    path = images.write_exr(tmp_path / "target.exr", {"primal": image}, aovs=["dd.T"])
+    (problem_view,) = make_problem(scene, box_and_lamp(), path, "l2", integrator, Settings()).views
+    assert np.array_equal(np.array(problem_view.target), image) and problem_view.aovs == ("dd.T",)
+    with_aovs = write_config(tmp_path, max_depth='aovs = "dd:depth"\nmax_depth')
+    assert config.problem_of(config.read(with_aovs)).views[0].target.shape == (16, 16, 4)
+    mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.UInt8, True).write(str(tmp_path / "a.png"))
+    alpha = images.write_exr(tmp_path / "alpha.exr", {"primal": image})
+    for target, error, words in (
+        (image[..., :3], ParameterError, r"\(16, 16, 4\), the last of which are dd.T: .*, or aovs"),
+        (tmp_path / "a.png", OptionError, "no channels dd.T: give an EXR file"),
+        (alpha, OptionError, "the sensor renders R, G, B, dd.T"),
+    ):
+        with pytest.raises(error, match=words):
+            psdr_jit.optimize(scene, box_and_lamp(), target, integrator=integrator)
 
 
 def test_grey_target_files(llvm, tmp_path):

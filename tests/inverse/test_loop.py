@@ -14,11 +14,12 @@ from inverse_problems import BOX, LAMP, box_and_lamp, problem_of, scene_of, targ
 
 import psdr_jit
 from psdr_jit import Parameter, Pose
-from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative import images, integrator_specs
 from psdr_jit.errors import OptionError, ParameterError, StalledWarning
 from psdr_jit.inverse import loop
 from psdr_jit.inverse.problem import make_problem
 from psdr_jit.inverse.settings import Settings
+from psdr_jit.inverse.targets import rendered
 from psdr_jit.scene import io as scene_io
 
 
@@ -54,6 +55,21 @@ def test_every_loss_goes_down(llvm, name):
     result = psdr_jit.optimize(scene, box, target_of(scene), loss=name,
                                integrator={"type": "psdr_path", "max_depth": 2}, iterations=20, spp=8)  # fmt: skip
     assert result.offsets[BOX]["distance"] < 0.06
+
+
+@pytest.mark.slow
+def test_a_box_is_found_by_its_depth(llvm, tmp_path):
+    """A loss of AOVs, whose channels are named in the files."""
+    scene, integrator = scene_of(), {"type": "psdr_path", "max_depth": 2, "aovs": "dd:depth"}
+    target = rendered(scene, 0, integrator_specs.build(integrator), 256)
+    box = Pose(BOX, 0.02, start_shift=(0.2, 0, 0), shift_axes="x")
+    result = psdr_jit.optimize(scene, box, target, integrator=integrator, iterations=40, spp=8, snapshot_every=39,
+                               loss=lambda image, wanted: dr.mean(dr.square((image - wanted)[:, :, 3:4]), axis=None),
+                               out=tmp_path, decay=0.1)  # fmt: skip
+    assert result.offsets[BOX]["distance"] < 0.03
+    for file in (next((tmp_path / "views").iterdir()), tmp_path / "snapshots" / "000039.exr"):
+        names = {name.partition(".")[2] for name in images.read_exr(file) if name.partition(".")[2] != "T"}
+        assert names == {"", "R", "G", "B", "dd.T"}, (file, names)
 
 
 def test_own_losses_integrators_and_variables(llvm):

@@ -202,7 +202,7 @@ def test_a_full_disk_does_not_end_a_run(llvm, tmp_path, monkeypatch):
     def full(*args):
         raise CheckpointError("no space left")
 
-    def failed(*args):
+    def failed(*args, **named):
         raise RuntimeError("OpenEXR says this where others say OSError")
 
     monkeypatch.setattr(checkpoints, "save", full)

@@ -39,6 +39,15 @@ def test_one_channel_image(tmp_path):
     assert set(images.read_exr(tmp_path / "y.exr")) == {"Y", "primal.Y"}
 
 
+@pytest.mark.parametrize("colours", ["Y", "YA", "RGB", "RGBA"])
+def test_aovs_do_not_pass_for_alpha(tmp_path, noise, colours):
+    image = np.concatenate([noise, noise], axis=-1)[..., : len(colours) + 2]
+    path = images.write_exr(tmp_path / "a.exr", {"total": image}, aovs=["dd.T", "ss.I"])
+    found = images.read_exr(path)
+    assert set(found) == {prefix + name for prefix in ("", "total.") for name in (*colours, "dd.T", "ss.I")}
+    assert np.array_equal(found["total.dd.T"], image[..., -2].astype(np.float32))
+
+
 def test_layers_of_different_size_are_rejected(tmp_path, noise):
     with pytest.raises(OptionError, match="one size"):
         images.write_exr(tmp_path / "a.exr", {"primal": noise, "total": noise[:3]})

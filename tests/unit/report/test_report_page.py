@@ -117,6 +117,12 @@ def test_an_interrupted_run_shows_its_snapshots(tmp_path):
         assert np.allclose(found[name], noise(k), rtol=1e-6)
 
 
+def test_aovs_are_no_layers(tmp_path):
+    layers = {name: np.ones((4, 4, 4)) for name in ("primal", "total")}
+    (view,) = sources.read(images.write_exr(tmp_path / "a.exr", layers, {"terms": "total"}, aovs=["dd.T"])).views
+    assert [(layer.name, layer.image.shape[-1]) for layer in view.layers] == [("primal", 3), ("total", 3)]
+
+
 def test_what_is_no_result_is_refused(tmp_path, capsys):
     (tmp_path / "a.exr").write_bytes(b"no image")
     for path, words in ((tmp_path, "log.jsonl"), (tmp_path / "b.exr", "no file"), (tmp_path / "a.exr", "OpenEXR")):
