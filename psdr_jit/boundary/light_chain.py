@@ -122,10 +122,13 @@ def _intensity(line: LightLine, ω: mi.Vector3f, wavelengths) -> mi.Spectrum:
 
 
 def _sent_on(job: Job, pair: Pair, side: int, Φ: mi.Spectrum, wavelengths) -> tuple[mi.Point2f, mi.Spectrum]:
-    """Where the light of segments that have parted lands on the film, and g there."""
+    """Where the light of segments that have parted lands on the film, and g there.
+
+    Nothing comes of segments whose ends would be vertices beyond the last: `take_up` connects what it is given.
+    """
     hit, β = (pair.b, pair.β_b) if side else (pair.a, pair.β_a)
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), dr.arange(mi.UInt32, dr.width(pair.k)))
-    β = dr.select(pair.in_light, 0, Φ * β)
+    β = dr.select(pair.in_light | (pair.k >= job.light.longest), 0, Φ * β)
     limits = replace(job.limits, light=job.light)
     path = take_up(job.scene, rng, hit, β, pair.k, wavelengths, limits, job.options.hide_emitters)
     return path.p, dr.select(path.count > 0, path.value, 0)

@@ -107,11 +107,14 @@ class LightCells:
 
 
 def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
-    """What chains from lights are traced in: steps that all move, or may, if lights do; and at the end, the camera."""
+    """What chains from lights are traced in: steps that all move, or may, if lights do; and at the end, the camera.
+
+    The line of sight of the sensor, behind y_longest, is a segment as well.
+    """
     world = ChainWorld.of(job)
     return replace(
         world,
-        depth=min(technique.longest, CHAIN_DEPTH),
+        depth=min(technique.longest + 1, CHAIN_DEPTH),
         camera=varying(mi.Bool, job.facts.emitters_move),
         lights=varying(mi.Bool, job.facts.camera_moves),
         connects=partial(compare_sensor, technique, job.options.hide_emitters),
