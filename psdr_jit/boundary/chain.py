@@ -47,7 +47,7 @@ from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
 from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
 from .chain_search import find_crossings
-from .chain_sweeps import AtRest, carry_adjoints, slope_at_end
+from .chain_sweeps import AtRest, adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
 NAME = "chain"
@@ -213,6 +213,7 @@ def _splat(job: Job, steps: Steps, value: mi.Spectrum) -> mi.TensorXf:
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the attached parameters."""
+    rejected = job.call.counters.rejected
     with dr.suspend_grad():
         for share, part in passes(job, BYTES):
             found = _steps(part)
@@ -220,15 +221,9 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 continue
             steps, chain = found
             λ = share * _adjoint(job, steps, grad_in)
-            λ = job.call.counters.rejected.keep_finite(mi.Color1f(λ)).x
-            line = steps.end.curve.line
-            o, d = mi.Point3f(line.o), mi.Vector3f(line.d)
-            with job.motion.attached(o, d) as moving:
-                accumulate(λ * steps.end.attached_F(o, d, moving, part.facts))
-                λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
-            λ_o, λ_d = carry_adjoints(chain, steps.end.segment, λ_o, λ_d, job.motion)
+            λ = rejected.keep_finite(mi.Color1f(λ)).x
+            λ_o, λ_d = adjoints_at_start(part.facts, chain, steps.end, λ, job.motion, rejected)
             if job.facts.camera_moves:
-                dr.eval(λ_o, λ_d)  # stored, as in `interior.term`: a pose asks for each of them twelve times
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)
                     accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))
@@ -268,7 +263,7 @@ TERM = Term(
     name=NAME,
     budget="spps",
     streams=(Stream.CHAIN_LINE, Stream.CHAIN_LOBES, Stream.CHAIN_GUIDE, Stream.CHAIN_CUTS, Stream.CHAIN_RADIANCE,
-             Stream.LIGHT_CHAIN),
+             Stream.LIGHT_CHAIN, Stream.LIGHT_CHAIN_PILOT),
     needed=needed,
     cost=cost,
     with_light=2.0,  # 3 beside a ball of glass, seen directly

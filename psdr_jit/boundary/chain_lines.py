@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.film_samples import FilmSamples
-from ..core.low_discrepancy import lane_sampler
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.rays import skip_emitters
 from ..plan.job import Job
 from .chain_fixed import Directions
-from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
+from .chain_trace import ChainWorld
+from .searched_lines import SearchedLines
 
 #: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
 NARROWEST = 2.0**-10
@@ -42,7 +42,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Lines:
+class Lines(SearchedLines):
     """The lines of a job, `job.spp` across a pixel, half of them horizontal on average. Host object."""
 
     job: Job
@@ -57,21 +57,8 @@ class Lines:
         world = ChainWorld.of(job)
         samples = FilmSamples.over(job.film, job.spp, job.density)
         lines = Lines(job, world, samples, Directions(samples.count, world.depth))
-        lines._guide()
-        dr.eval(lines.directions.data)
+        lines.guide()
         return lines
-
-    def _guide(self) -> None:
-        """Draw the directions of all lines."""
-        sample = dr.arange(mi.UInt32, self.count)
-        sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
-        line, s = self.line(sample), sampler.next_1d()
-        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
-        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
-
-    def _numbers(self, sample: mi.UInt32):
-        """What chooses lobes and points of light, for all chains of a line."""
-        return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
 
     def line(self, sample: mi.UInt32) -> Line:
         rng = self.samples.sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample)
@@ -101,12 +88,6 @@ class Lines:
         if not self.job.options.hide_emitters:
             return mi.Ray3f(ray)
         return skip_emitters(self.job.scene, ray, self.job.scene.ray_intersect_preliminary(ray))[0]
-
-    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float], store: ChainRecords | None = None) -> Pair:
-        """The chains from two places on the lines `sample`."""
-        line = self.line(sample)
-        rays = self.ray(line, ends[0]), self.ray(line, ends[1])
-        return trace_pair(self.world, rays, self._numbers(sample), (self.directions, sample), store)
 
     @property
     def least_width(self) -> mi.Float:

@@ -1,6 +1,6 @@
 """Where the view through chains of delta vertices steps: crossings of short lines on the film with what is seen there.
 
-A crossing between the ends of a line (`chain_lines`) shows in that their chains part (`chain_trace`), and is found by
+A crossing between the ends of a line (`searched_lines`) shows as their chains part (`chain_trace`), and is found by
 halving. Two crossings may hide each other, so an interval is looked at again: where its ends agree it is cut into n
 parts, and each goes on in its place with probability s/n and n/s of its weight; on both sides of a crossing always.
 Every crossing is then found with expected weight 1, and the cost is that of 1/(1 − s) looks. What is narrower by a
@@ -25,7 +25,7 @@ import mitsuba as mi
 from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
-from .chain_lines import Lines
+from .searched_lines import SearchedLines
 
 #: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
 #: which probability one of them goes on where the ends agree: if they see a delta lobe, and elsewhere.
@@ -130,7 +130,7 @@ class Finds:
 
 
 @dr.syntax
-def _searched(lines: Lines, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds) -> Search:
+def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds) -> Search:
     """Go on with searches until they pause or end; fills `finds`.
 
     `pause`: the number of looks after which one does, and whether one does before it begins to halve.
@@ -196,7 +196,7 @@ def _width(part: Search | Crossing) -> int:
     return dr.width(part.at.sample)
 
 
-def find_crossings(lines: Lines) -> Crossing | None:
+def find_crossings(lines: SearchedLines) -> Crossing | None:
     """All crossings that the lines' intervals lead to; None if there are none."""
     n = lines.count
     sample = dr.arange(mi.UInt32, n)

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.ad import tangents
+from ..core.ad import accumulate, tangents
+from ..core.counters import Counter
 from ..core.records import Hit
 from ..paths.delta_step import delta_step
 from ..plan.motion import Displacements, Motion, SceneDisplacements
@@ -99,3 +100,23 @@ def slope_at_end(facts: SceneFacts, chain: ChainRecords, end, camera: tuple, mot
         dr.set_grad(o, o_grad)
         dr.set_grad(d, d_grad)
         return tangents(end.attached_F(o, d, moving, facts))
+
+
+def adjoints_at_start(
+    facts: SceneFacts, chain: ChainRecords, end, λ: mi.Float, motion: Motion, rejected: Counter
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Adjoints `(λ_o, λ_d)` of the first rays of chains, given those `λ` of F at their `end`; θ receives its share.
+
+    The transpose of `slope_at_end`. What is not finite is dropped and counted before it goes on to other surfaces;
+    where λ = 0 an infinite derivative does no harm, as Dr.Jit leaves out what has a gradient of 0.
+    """
+    o, d = mi.Point3f(end.curve.line.o), mi.Vector3f(end.curve.line.d)
+    with motion.attached(o, d) as moving:
+        accumulate(λ * end.attached_F(o, d, moving, facts))
+        adjoints = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
+    dr.eval(adjoints)
+    λ_o, λ_d = (rejected.keep_finite(v) for v in adjoints)
+    adjoints = carry_adjoints(chain, end.segment, λ_o, λ_d, motion)
+    dr.eval(adjoints)  # stored, as in `interior.term`: a pose asks for each of them twelve times
+    λ_o, λ_d = (rejected.keep_finite(v) for v in adjoints)
+    return λ_o, λ_d

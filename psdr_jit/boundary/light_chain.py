@@ -46,7 +46,7 @@ from ..scene.facts import SceneFacts
 from .chain_fixed import Directions
 from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
 from .chain_search import find_crossings
-from .chain_sweeps import AtRest, carry_adjoints, slope_at_end
+from .chain_sweeps import AtRest, adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 from .light_chain_lines import LightCells, LightLine, LightLines, sensor_view
 
@@ -122,10 +122,13 @@ def _intensity(line: LightLine, ω: mi.Vector3f, wavelengths) -> mi.Spectrum:
 
 
 def _sent_on(job: Job, pair: Pair, side: int, Φ: mi.Spectrum, wavelengths) -> tuple[mi.Point2f, mi.Spectrum]:
-    """Where the light of segments that have parted lands on the film, and g there."""
+    """Where the light of segments that have parted lands on the film, and g there.
+
+    Nothing comes of segments whose ends would be vertices beyond the last: `take_up` connects what it is given.
+    """
     hit, β = (pair.b, pair.β_b) if side else (pair.a, pair.β_a)
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), dr.arange(mi.UInt32, dr.width(pair.k)))
-    β = dr.select(pair.in_light, 0, Φ * β)
+    β = dr.select(pair.in_light | (pair.k >= job.light.longest), 0, Φ * β)
     limits = replace(job.limits, light=job.light)
     path = take_up(job.scene, rng, hit, β, pair.k, wavelengths, limits, job.options.hide_emitters)
     return path.p, dr.select(path.count > 0, path.value, 0)
@@ -255,17 +258,12 @@ def forward(job: Job) -> mi.TensorXf:
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the attached parameters; the transpose of `forward`."""
+    rejected = job.call.counters.rejected
     for share, part, steps in _parts(job):
         for side in steps.sides:
             λ = share * _adjoint(part, steps, side, grad_in)
-            λ = job.call.counters.rejected.keep_finite(mi.Color1f(λ)).x
-            line = steps.end.curve.line
-            o, d = mi.Point3f(line.o), mi.Vector3f(line.d)
-            with job.motion.attached(o, d) as moving:
-                accumulate(λ * steps.end.attached_F(o, d, moving, job.facts))
-                λ_o, λ_d = mi.Vector3f(dr.grad(o)), mi.Vector3f(dr.grad(d))
-            λ_o, λ_d = carry_adjoints(steps.chain, steps.end.segment, λ_o, λ_d, job.motion)
-            dr.eval(λ_o, λ_d)
+            λ = rejected.keep_finite(mi.Color1f(λ)).x
+            λ_o, λ_d = adjoints_at_start(job.facts, steps.chain, steps.end, λ, job.motion, rejected)
             with job.motion.attached() as moving:
                 o, d = _leave(moving, side)
                 accumulate(dr.dot(λ_o, o) + dr.dot(λ_d, d))

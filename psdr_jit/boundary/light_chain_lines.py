@@ -40,7 +40,8 @@ from ..plan.job import Job
 from ..sampling.distribution import EdgeDistribution, edge_distribution, pmf, sample_edge
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import LEAST_WIDTH
-from .chain_trace import CHAIN_DEPTH, ChainRecords, ChainWorld, Numbers, Pair, guide, trace_pair
+from .chain_trace import CHAIN_DEPTH, ChainWorld, Numbers, Pair
+from .searched_lines import SearchedLines
 
 #: Cells along one side of the square.
 CELLS = 64
@@ -107,11 +108,14 @@ class LightCells:
 
 
 def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
-    """What chains from lights are traced in: steps that all move, or may, if lights do; and at the end, the camera."""
+    """What chains from lights are traced in: steps that all move, or may, if lights do; and at the end, the camera.
+
+    The line of sight of the sensor, behind y_longest, is a segment as well.
+    """
     world = ChainWorld.of(job)
     return replace(
         world,
-        depth=min(technique.longest, CHAIN_DEPTH),
+        depth=min(technique.longest + 1, CHAIN_DEPTH),
         camera=varying(mi.Bool, job.facts.emitters_move),
         lights=varying(mi.Bool, job.facts.camera_moves),
         connects=partial(compare_sensor, technique, job.options.hide_emitters),
@@ -120,7 +124,7 @@ def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
 
 
 @dataclass(frozen=True)
-class LightLines:
+class LightLines(SearchedLines):
     """The lines of a job, `count` in all, half of them horizontal on average. Host object."""
 
     job: Job  # with a seed of its own
@@ -145,20 +149,8 @@ class LightLines:
         world = sensor_world(job, technique)
         cells = cells or LightCells.even(dr.width(points) * len(technique.sources.targets))
         lines = LightLines(own, world, points, technique.sources, count, cells, Directions(count, world.depth))
-        lines._guide()
-        dr.eval(lines.directions.data)
+        lines.guide()
         return lines
-
-    def _guide(self) -> None:
-        """Draw the directions of all lines."""
-        sample = dr.arange(mi.UInt32, self.count)
-        sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
-        line, s = self.line(sample), sampler.next_1d()
-        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
-        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
-
-    def _numbers(self, sample: mi.UInt32):
-        return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
 
     @property
     def _targets(self) -> Sequence:
@@ -197,12 +189,6 @@ class LightLines:
 
     def ray(self, line: LightLine, s: mi.Float) -> mi.Ray3f:
         return mi.Ray3f(line.y, line.direction(line.at(s)))
-
-    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float], store: ChainRecords | None = None) -> Pair:
-        """The chains from two places on the lines `sample`."""
-        line = self.line(sample)
-        rays = self.ray(line, ends[0]), self.ray(line, ends[1])
-        return trace_pair(self.world, rays, self._numbers(sample), (self.directions, sample), store)
 
     @property
     def least_width(self) -> mi.Float:

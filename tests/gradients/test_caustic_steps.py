@@ -99,6 +99,23 @@ CASES = [
 
 
 @pytest.mark.slow
+def test_paths_as_long_as_may_be(llvm):
+    """In, out, floor, sensor: what the sensor sees of the last vertex that there may be steps as well."""
+    motion = perturb(glass(way="view"), "card.to_world", direction=X)
+    estimate = forward(motion, bdpt(form="spatial", max_depth=4), SEEDS, 512)
+    assert_grad_close(estimate, differences(motion, bdpt(max_depth=4), 0.001, 2048), max_stderr=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("max_depth, lit", [(3, False), (4, True)])
+def test_no_path_is_longer_than_it_may_be(llvm, max_depth, lit):
+    """The card is in the shadow of the ball: only what comes through the ball, by two vertices, can light it."""
+    motion = perturb(glass(way="caustic"), "card.to_world", direction=X)
+    steps = {"form": "spatial", "sppc": 0, "sppp": 0, "spps": 64, "sppd": 0, "sppi": 0}
+    assert forward(motion, bdpt(**steps, max_depth=max_depth), 1, 0).any() == lit
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("param, how, scene", CASES, ids=lambda value: "")
 def test_glass(llvm, param, how, scene):
     motion = perturb(glass(**scene), param, **how)

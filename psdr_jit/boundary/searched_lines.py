@@ -1,0 +1,61 @@
+"""Lines whose chains are searched for where they part (`chain_search`), whatever they lie across.
+
+Those across the film start at the sensor (`chain_lines`), those across what lights shine on at the lights
+(`light_chain_lines`). What the chains of a line have in common is drawn in the same way for both.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.low_discrepancy import lane_sampler
+from ..core.streams import Stream, stream_seed
+from ..plan.job import Job
+from .chain_fixed import Directions
+from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
+
+
+class SearchedLines(ABC):
+    """The lines of a job, numbered from 0. Host object."""
+
+    job: Job
+    world: ChainWorld
+    directions: Directions  # of their smooth vertices
+    narrowest: float  # intervals as short as this are not cut
+    first_kept: int  # segment: steps of those before are left to others
+    count: int  # number of lines
+
+    @abstractmethod
+    def line(self, sample: mi.UInt32):
+        """The lines number `sample`."""
+
+    @abstractmethod
+    def ray(self, line, s: mi.Float) -> mi.Ray3f:
+        """The first segment of the chain from a share `s` of the way along."""
+
+    @property
+    @abstractmethod
+    def least_width(self) -> mi.Float:
+        """Width at which halving ends."""
+
+    def guide(self) -> None:
+        """Draw the directions of all lines."""
+        sample = dr.arange(mi.UInt32, self.count)
+        sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
+        line, s = self.line(sample), sampler.next_1d()
+        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
+        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
+        dr.eval(self.directions.data)
+
+    def _numbers(self, sample: mi.UInt32):
+        """What chooses lobes and the points at the other end, for all chains of a line."""
+        return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
+
+    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float], store: ChainRecords | None = None) -> Pair:
+        """The chains from two places on the lines `sample`."""
+        line = self.line(sample)
+        rays = self.ray(line, ends[0]), self.ray(line, ends[1])
+        return trace_pair(self.world, rays, self._numbers(sample), (self.directions, sample), store)
