@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.memory import Memory, Slot
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
@@ -25,6 +26,9 @@ from .topology import INVALID
 
 #: Sine of the angle between two faces from which one stands off the other.
 STANDS_OFF = 0.05
+
+#: Of an integrator: contacts with lights that have been looked at, by the names of the two.
+LOOKED_AT: Slot[dict[tuple[str, str], Contact]] = Slot(dict)
 
 
 def warn_about_material(job: Job, found: EdgeSet) -> None:
@@ -51,9 +55,7 @@ def warn_about_lamps(job: Job, found: EdgeSet) -> None:
     """
     if job.options.depth_limit < 2 or dr.flag(dr.JitFlag.FreezingScope):
         return
-    for a, b in _touching(found):
-        if not (a.is_emitter() or b.is_emitter()):
-            continue
+    for a, b in _touching_lamps(found, job.call.memory):
         lamp, other = (a, b) if a.is_emitter() else (b, a)
         warn_once(
             f"the area light '{lamp.id()}' touches '{other.id()}' or cuts into it: where the two meet, the derivative "
@@ -64,14 +66,22 @@ def warn_about_lamps(job: Job, found: EdgeSet) -> None:
         )
 
 
-def _touching(found: EdgeSet) -> Iterator[tuple[mi.Shape, mi.Shape]]:
-    """Pairs that meet at an angle: a flat light on a ceiling, in one plane with it, does not shine on that."""
+def _touching_lamps(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs with a light that meet at an angle: a flat light on a ceiling, in its plane, does not shine on that.
+
+    A contact that has been looked at before is left out: it is one and the same object until a mesh changes.
+    """
     for c in found.contacts:
-        if c.a is not c.b and _at_an_angle(c):
-            yield c.a.mesh, c.b.mesh
+        a, b = c.a.mesh, c.b.mesh
+        if c.a is c.b or not (a.is_emitter() or b.is_emitter()) or memory[LOOKED_AT].get((a.id(), b.id())) is c:
+            continue
+        memory[LOOKED_AT][a.id(), b.id()] = c
+        if _at_an_angle(c):
+            yield a, b
     for first, second in found.junctions.pairs if found.junctions is not None else ():
-        if first is not second:
-            yield _shape(first), _shape(second)
+        a, b = _shape(first), _shape(second)
+        if first is not second and (a.is_emitter() or b.is_emitter()):
+            yield a, b
 
 
 def _at_an_angle(contact: Contact) -> bool:
