@@ -30,7 +30,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.ad import accumulate, backpropagate, tangents
+from ..core.ad import accumulate, tangents
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
@@ -43,17 +43,15 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_chain
+from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
-from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
+from .chain_outline import Curve, beside_line
 from .chain_search import find_crossings
-from .chain_sweeps import AtRest, adjoints_at_start, slope_at_end
+from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
 NAME = "chain"
-
-#: Largest distance on the film from a crossing to the curve that it is thought to belong to [px]: halving ends closer.
-MOST_OFF = 0.02
 
 #: Memory of one line: an interval, its comparison, its share of what is found, and its directions.
 BYTES = 256 + CHAIN_DEPTH * Directions.BYTES
@@ -140,11 +138,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     found = find_crossings(lines)
     if found is None:
         return None
-    chain = ChainRecords(dr.width(found.k), lines.world.depth)
-    pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
-    dr.eval(pair, chain.hits, chain.bends)
-    curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
-    dr.eval(curve)
+    chain, pair, curve = crossings(lines, found)
     line = lines.line(found.at.sample)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
@@ -154,29 +148,18 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     end = End(pair.last, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
-    F_x, F_y = (_film_slope(lines, chain, end, (p, line, axis)) for axis in (0, 1))
-    slope2 = dr.square(F_x) + dr.square(F_y)
-    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
-    along = dr.select(line.horizontal, F_x, F_y)
-    per_F = dr.select(valid, -along / slope2 * found.at.weight / lines.per_pixel(found.at.sample), 0)
+    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
+    per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)
     return steps, chain
 
 
-def _film_slope(lines: Lines, chain: ChainRecords, end: End, at: tuple) -> mi.Float:
-    """Derivative of F by the film position [m/px], along the axis of `at`: (position, line, axis)."""
-    p, line, axis = at
-    q = mi.Point2f(p)
-    with dr.resume_grad():
-        dr.enable_grad(q)
-    with dr.resume_grad(q):
-        dr.set_grad(q, mi.Point2f(1 - axis, axis))
-        ray, _ = lines.job.sensor.sample_ray(0, line.wavelength, lines.film(q), line.aperture)
-        first = chain.segment(mi.UInt32(0), mi.Bool(True))
-        start = ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d))
-        o_grad, d_grad = tangents(start, ray.d)
-    return slope_at_end(lines.job.facts, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
+def _first(lines: Lines, chain: ChainRecords, line, q: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f]:
+    """The first segments at the film position q, attached to it: their starts and directions."""
+    ray, _ = lines.job.sensor.sample_ray(0, line.wavelength, lines.film(q), line.aperture)
+    first = chain.segment(mi.UInt32(0), mi.Bool(True))
+    return ray.o + ray.d * dr.detach(dr.dot(first.o - ray.o, ray.d)), ray.d
 
 
 def _camera(moving, steps: Steps, chain: ChainRecords) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -220,7 +203,8 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             if found is None:
                 continue
             steps, chain = found
-            λ = share * _adjoint(job, steps, grad_in)
+            count = dr.width(steps.end.segment)
+            λ = share * adjoint_of_speed(lambda F_θ: _splat(job, steps, steps.value * F_θ), count, grad_in)
             λ = rejected.keep_finite(mi.Color1f(λ)).x
             λ_o, λ_d = adjoints_at_start(part.facts, chain, steps.end, λ, job.motion, rejected)
             if job.facts.camera_moves:
@@ -230,16 +214,6 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             dr.eval()
         if job.light is not None:
             light_chain.backward(job, grad_in)
-
-
-def _adjoint(job: Job, steps: Steps, grad_in: mi.TensorXf) -> mi.Float:
-    """Derivative of ⟨grad_in, image⟩ by F_θ of every crossing."""
-    with dr.resume_grad():
-        F_grad = dr.zeros(mi.Float, dr.width(steps.end.segment))
-        dr.enable_grad(F_grad)
-    with dr.resume_grad(F_grad):
-        backpropagate(_splat(job, steps, steps.value * F_grad), grad_in)
-        return dr.grad(F_grad)
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:

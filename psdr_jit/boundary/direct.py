@@ -31,7 +31,6 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.kind import Use
-from ..edges.kind_junction import Junctions
 from ..edges.location import EdgeLocation
 from ..edges.points import LEAST_SLANT, start_height
 from ..options import Options
@@ -134,7 +133,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     r = pd.t - on.lead
     # A contour's own surface may begin within its lead.
     active &= pd.is_valid() & (r > dr.select(on.aside > 0, on.offset, on.lead))
-    if any(isinstance(kind, Junctions) for kind in edges.table.kinds):
+    if any(kind.surfaces_meet for kind in edges.table.kinds):
         active &= ~thinner_than_lift(scene, pd, down, active)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)

@@ -28,12 +28,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.ad import accumulate, backpropagate, tangents
+from ..core.ad import accumulate, tangents
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.sensor_frame import lens_point
@@ -43,15 +44,13 @@ from ..paths.light_walk import take_up
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
+from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
 from .chain_fixed import Directions
-from .chain_outline import AnalyticShapes, Curve, beside_line, crossed_curve
+from .chain_outline import Curve, beside_line
 from .chain_search import find_crossings
-from .chain_sweeps import AtRest, adjoints_at_start, slope_at_end
+from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 from .light_chain_lines import LightCells, LightLine, LightLines, sensor_view
-
-#: Largest distance from a crossing to the curve that it is thought to belong to, in cells: halving ends closer.
-MOST_OFF = 0.02
 
 #: Memory of one line, as in `chain`.
 BYTES = 256 + CHAIN_DEPTH * Directions.BYTES
@@ -151,11 +150,7 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     if found is None:
         return None
     job = lines.job
-    chain = ChainRecords(dr.width(found.k), lines.world.depth)
-    pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
-    dr.eval(pair, chain.hits, chain.bends)
-    curve = crossed_curve(AnalyticShapes.of(job), lines.world.patterns, pair)
-    dr.eval(curve)
+    chain, pair, curve = crossings(lines, found)
     line = lines.line(found.at.sample)
     p = line.at(found.at.lo)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
@@ -165,11 +160,8 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 
-    F_x, F_y = (_slope_across(lines, chain, end, (p, line, axis)) for axis in (0, 1))
-    slope2 = dr.square(F_x) + dr.square(F_y)
-    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
-    along = dr.select(line.horizontal, F_x, F_y)
-    per_F = dr.select(valid, -along / slope2 * lines.measure(line, p), 0)
+    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (mi.Point3f(line.y), line.direction(q)))
+    per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
     for i, hit in enumerate((pair.a, pair.b)):
         landed, g = _sent_on(job, pair, i, Φ, wavelengths)
@@ -192,19 +184,6 @@ def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> Ligh
         lens = frame.to_world @ lens_point(frame, aperture)
         distance = dr.norm(lens - curve.line.o)
     return LightEnd(pair.last, curve, pair.in_light, view.film, aperture, lens, distance)
-
-
-def _slope_across(lines: LightLines, chain: ChainRecords, end: LightEnd, at: tuple) -> mi.Float:
-    """Derivative of F by the place on the light's film [m/cell], along the axis of `at`: (place, line, axis)."""
-    p, line, axis = at
-    q = mi.Point2f(p)
-    with dr.resume_grad():
-        dr.enable_grad(q)
-    with dr.resume_grad(q):
-        dr.set_grad(q, mi.Point2f(1 - axis, axis))
-        d_grad = tangents(line.direction(q))
-    at_rest = AtRest(lines.job.sensor)
-    return slope_at_end(lines.job.facts, chain, end, (mi.Vector3f(0), d_grad), at_rest)
 
 
 def _leave(moving: Displacements, side: Side) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -243,6 +222,10 @@ def _splat(job: Job, steps: LightSteps, side: Side, value: mi.Spectrum) -> mi.Te
     return films.develop_splats(job.film, side.p, value, steps.wavelengths, side.valid)
 
 
+def _splat_moved(job: Job, steps: LightSteps, side: Side, F_θ: mi.Float) -> mi.TensorXf:
+    return _splat(job, steps, side, side.value * F_θ)
+
+
 def forward(job: Job) -> mi.TensorXf:
     """Derivative image along the tangents set on the scene's parameters. Detached; `dr.suspend_grad` is on."""
     image = films.black(job.film)
@@ -261,20 +244,11 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
     rejected = job.call.counters.rejected
     for share, part, steps in _parts(job):
         for side in steps.sides:
-            λ = share * _adjoint(part, steps, side, grad_in)
+            splat = partial(_splat_moved, part, steps, side)
+            λ = share * adjoint_of_speed(splat, dr.width(steps.end.segment), grad_in)
             λ = rejected.keep_finite(mi.Color1f(λ)).x
             λ_o, λ_d = adjoints_at_start(job.facts, steps.chain, steps.end, λ, job.motion, rejected)
             with job.motion.attached() as moving:
                 o, d = _leave(moving, side)
                 accumulate(dr.dot(λ_o, o) + dr.dot(λ_d, d))
             dr.eval()
-
-
-def _adjoint(job: Job, steps: LightSteps, side: Side, grad_in: mi.TensorXf) -> mi.Float:
-    """Derivative of ⟨grad_in, image⟩ by F_θ of every crossing."""
-    with dr.resume_grad():
-        F_grad = dr.zeros(mi.Float, dr.width(steps.end.segment))
-        dr.enable_grad(F_grad)
-    with dr.resume_grad(F_grad):
-        backpropagate(_splat(job, steps, side, side.value * F_grad), grad_in)
-        return dr.grad(F_grad)

@@ -146,6 +146,7 @@ class EdgeKind(ABC):
     """One family of discontinuities."""
 
     blocks_light: ClassVar[bool] = True  # do shadow rays notice it at all?
+    surfaces_meet: ClassVar[bool] = False  # along it, two surfaces cut into each other
     shades_only: ClassVar[bool] = False  # does only what one surface sends step there, not its place or normal?
 
     @property

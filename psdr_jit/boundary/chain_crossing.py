@@ -1,0 +1,65 @@
+"""Where a searched line crosses a curve: what it crosses, how fast F changes along the film there, and the way back.
+
+The same for lines across the film (`chain`) and across what lights shine on (`light_chain`): with F the signed distance
+of the last line of sight from the curve, and its slope (F_x, F_y) by the place p on the film, the crossing of a line
+along the axis X stands for −F_X / |∇F|² per unit of F_θ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.ad import backpropagate, tangents
+from .chain_outline import AnalyticShapes, Curve, crossed_curve
+from .chain_sweeps import AtRest, slope_at_end
+from .chain_trace import ChainRecords, Pair
+from .searched_lines import SearchedLines
+
+#: Largest distance on the film from a crossing to the curve that it is thought to belong to [px, or cells]: halving
+#: ends closer.
+MOST_OFF = 0.02
+
+
+def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
+    """Of the intervals that `chain_search` has `found`: the chains at their ends, and the curves in between."""
+    chain = ChainRecords(dr.width(found.k), lines.world.depth)
+    pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
+    dr.eval(pair, chain.hits, chain.bends)
+    curve = crossed_curve(AnalyticShapes.of(lines.job), lines.world.patterns, pair)
+    dr.eval(curve)
+    return chain, pair, curve
+
+
+def step_per_slope(lines: SearchedLines, chain: ChainRecords, end, at: tuple, first: Callable):
+    """`(valid, −F_X / |∇F|²)` at `at`: (place, line); `first` gives the attached starts and directions of the first
+    segments at a place. Detached."""
+    p, line = at
+    F_x, F_y = (_slope(lines, chain, end, p, axis, first) for axis in (0, 1))
+    slope2 = dr.square(F_x) + dr.square(F_y)
+    valid = end.curve.valid & (dr.square(end.curve.F) < dr.square(MOST_OFF) * slope2)
+    along = dr.select(line.horizontal, F_x, F_y)
+    return valid, -along / slope2
+
+
+def _slope(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, axis: int, first: Callable) -> mi.Float:
+    """Derivative of F by the place on the film, along one axis."""
+    q = mi.Point2f(p)
+    with dr.resume_grad():
+        dr.enable_grad(q)
+    with dr.resume_grad(q):
+        dr.set_grad(q, mi.Point2f(1 - axis, axis))
+        o_grad, d_grad = tangents(*first(q))
+    return slope_at_end(lines.job.facts, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
+
+
+def adjoint_of_speed(splat: Callable[[mi.Float], mi.TensorXf], count: int, grad_in: mi.TensorXf) -> mi.Float:
+    """Derivative of ⟨grad_in, splat(F_θ)⟩ by F_θ of each of `count` crossings."""
+    with dr.resume_grad():
+        F_grad = dr.zeros(mi.Float, count)
+        dr.enable_grad(F_grad)
+    with dr.resume_grad(F_grad):
+        backpropagate(splat(F_grad), grad_in)
+        return dr.grad(F_grad)
