@@ -34,6 +34,7 @@ from ..core.ad import accumulate, tangents
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
+from ..edges.followed_lights import followed_lights
 from ..options import Options
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
@@ -111,7 +112,10 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), i)
     ray = mi.Ray3f(hit.o, hit.d, 0, dr.gather(type(wavelengths), wavelengths, i))
     limits = job.limits.beyond(of.k)
-    L, _, _ = walk(job.scene, rng, ray, hit.intersection(), limits, NoSink(), of.emits, ~of.in_light)
+    pi, emits, followed = hit.intersection(), of.emits, followed_lights(job)
+    if followed is not None:
+        emits = emits | followed.has(pi.shape.emitter(), pi.is_valid())
+    L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), emits, ~of.in_light)
     L = L * β
     dr.eval(L)
     even = 2 * dr.arange(mi.UInt32, n)

@@ -23,6 +23,7 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
+from ..edges.followed_lights import FollowedLights, followed_lights
 from ..plan.job import Job
 from ..plan.probe_motion import registry_table
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
@@ -53,6 +54,7 @@ class ChainWorld:
     lights: mi.Bool  # ... or because lights do?
     connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
+    followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
 
     @staticmethod
     def of(job: Job) -> ChainWorld:
@@ -71,6 +73,7 @@ class ChainWorld:
             lights=varying(mi.Bool, lights),
             connects=compare_light,
             mode=mi.TransportMode.Radiance,
+            followed=followed_lights(job),
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
@@ -245,6 +248,8 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
     a, b = ends
     active = active & mi.has_flag(a.bsdf().flags(), mi.BSDFFlags.Smooth)
     light = draw_light(world.scene, u.emitter, u.light, active)
+    if world.followed is not None:
+        active &= ~world.followed.has(light.pointer(), active)
     hit_a, seen_a = light.seen_from(world.scene, a, active)
     hit_b, seen_b = light.seen_from(world.scene, b, active)
     parts = active & (seen_a != seen_b)

@@ -14,7 +14,8 @@ infinitely distant emitters have r_B/r_S = 0, and a directional light that turns
 replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
 brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`), and so
-do the planes of coarse smooth-shaded faces (`horizons.py`).
+do the planes of coarse smooth-shaded faces (`horizons.py`). Lights that touch what they shine on are left to the
+indirect term (`edges/followed_lights.py`).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
+from ..edges.followed_lights import followed_lights
 from ..edges.kind import Use
 from ..edges.location import EdgeLocation
 from ..edges.points import LEAST_SLANT, start_height
@@ -116,6 +118,9 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     """The lines that end on a receiver and on a visible emitter; all others are left out (value 0)."""
     scene, light, on = job.scene, line.light, line.light.on
     active = light.valid & (light.pdf > 0) & dr.any(light.value != 0)
+    followed = followed_lights(job)
+    if followed is not None:
+        active &= ~followed.has(light.emitter, active)
 
     # Towards the source: closest hit, so that the point on an area light can be attached.
     on_surface = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Surface)

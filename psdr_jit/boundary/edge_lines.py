@@ -16,6 +16,7 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
+from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, Sight
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
@@ -130,5 +131,6 @@ def longest_path(job: Job) -> int:
 
 def longest_subpath(job: Job) -> int:
     """Vertices from the sensor to the receiver that are recorded, at most."""
-    beyond = 1 if job.facts.has_delta_lobes else 0  # delta lobes see what the other side of the edge emits
+    # delta lobes see what the other side of the edge emits, and so do all of lights that are followed
+    beyond = 1 if job.facts.has_delta_lobes or followed_lights(job) is not None else 0
     return recorded_vertices(job, longest_path(job) + beyond)

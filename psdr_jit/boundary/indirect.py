@@ -5,11 +5,11 @@ side and what is seen just past the edge on the other. Measure: edge length × s
 
     (L_− − L_+) · W · |τ×ω| · s·(v_B − u_D) / pdf,        s = τ×ω/|τ×ω|
 
-L_∓ are the radiances that x_D receives from beside the edge on the side −s and +s, *without* what the first vertex
-emits (that is the direct term, in material form), traced with common random numbers. In the spatial form this covers
-silhouettes as well as visible creases, borders and seams, of moving and of static shapes: a static edge moves in the
-view of a sliding x_D. It is the boundary integral of [Zhang et al. 2020, §5], two-sided because directions, not
-points, are kept.
+L_∓ are the radiances that x_D receives from beside the edge on the side −s and +s, traced with common random numbers.
+What the first vertex emits does not count (that is the direct term, in material form), but for lights that touch what
+they shine on (`edges/followed_lights.py`). In the spatial form this covers silhouettes as well as visible creases,
+borders and seams, of moving and of static shapes: a static edge moves in the view of a sliding x_D. It is the boundary
+integral of [Zhang et al. 2020, §5], two-sided because directions, not points, are kept.
 The planes of coarse smooth-shaded faces take a part of the samples (`horizons.py`).
 The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond the first vertex past the edge.
 """
@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.streams import Stream
+from ..edges.followed_lights import followed_lights
 from ..edges.kind import Use
 from ..edges.table import EdgeTable, look_beside
 from ..options import Options
@@ -68,29 +69,36 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
     if n == 0:
         return dr.zeros(mi.Spectrum, dr.width(lane))
     slot = slots(records, kept)
-    by_depth, final = _both_sides(job, table, dr.gather(EdgeView, view, kept), longest_path(job) + 1)
+    by_depth, final, followed = _both_sides(job, table, dr.gather(EdgeView, view, kept), longest_path(job) + 1)
     needed = dr.gather(mi.Bool, useful, lane)
     slot = 2 * dr.gather(mi.UInt32, slot, lane)
 
-    def step(k: mi.UInt32) -> mi.Spectrum:
-        minus, plus = (
-            by_depth.up_to(k, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed)) for side in (0, 1)
-        )
-        return minus - plus
+    def arrives(side: int, k: mi.UInt32) -> mi.Spectrum:
+        return by_depth.up_to(k, slot + side, dr.gather(mi.Spectrum, final, slot + side, needed))
 
-    found = step(left)
-    if records.delta is not None:  # what the first vertex emits is seen by delta lobes alone
-        found -= records.left_by_smooth_lobes(step(0 * left))
+    def emitted(side: int) -> mi.Spectrum:
+        return dr.select(dr.gather(mi.Bool, followed, slot + side, needed), 0, arrives(side, 0 * left))
+
+    found = arrives(0, left) - arrives(1, left)
+    if records.delta is not None:  # what else the first vertex emits is seen by delta lobes alone
+        found -= records.left_by_smooth_lobes(emitted(0) - emitted(1))
     return dr.select(needed, found, 0)
 
 
 def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
-    """Radiance from both sides of every edge point, by depth: `(by_depth, final)`, 2 lanes each (−, +)."""
+    """Radiance from both sides of every edge point, by depth: `(by_depth, final, followed)`, 2 lanes each (−, +).
+
+    `followed`: lanes that count what they meet first emits, whatever lobe of the receiver sees it.
+    """
     index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
     ray, pi, differs = look_beside(job.scene, table, v.sight, which, v.wavelengths)
-    emission = mi.Bool(job.facts.has_delta_lobes)  # seen by delta lobes, and taken off again for all others
-    return radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission)
+    lights = followed_lights(job)
+    meets = differs & pi.is_valid()
+    followed = dr.full(mi.Bool, False, dr.width(index)) if lights is None else lights.has(pi.shape.emitter(), meets)
+    # the emission of others is seen by delta lobes, and taken off again for smooth ones
+    emission = mi.Bool(True) if job.facts.has_delta_lobes else followed
+    return *radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission), followed
 
 
 #: What its lines are drawn for, by form.
@@ -153,6 +161,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Surfaces see each other, and something moves in their view."""
     if steps_rest(facts):
         return False, steps_rest(facts)
+    if geometry.touched_lamp:
+        return True, f"what surfaces see of each other moves, and of '{geometry.touched_lamp}', which touches some"
     if options.depth_limit < 3:
         return False, f"max_depth = {options.depth_limit}: light is scattered once at most"
     if geometry.lone_convex:

@@ -16,6 +16,7 @@ from ..core.counters import Counters
 from ..core.film import require_film
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
+from ..edges.followed_lights import followed_lights
 from ..errors import OptionError, ZeroDerivativeWarning
 from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
@@ -180,7 +181,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     call, budgets = q.call, q.budgets
     geometry = _geometry(q, call.options.plan == "lean")
-    forms, reason = forms_to_try(call.scene, q.facts, call.options)
+    forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
         terms = decide(TERMS, q.facts, call.options, geometry, spp)
@@ -216,9 +217,13 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
 def _geometry(q: _Question, prunes: bool) -> Geometry:
     """What the terms want to know about the shapes' vertices, where anything is left out by it."""
     call = q.call
-    if not (q.facts.geometry_moves and prunes):
+    if not q.facts.geometry_moves:
         return Geometry()
-    return Geometry(lone_convex(call.scene, call.sensor, q.facts, call.memory))
+    alone = lone_convex(call.scene, call.sensor, q.facts, call.memory) if prunes else ""
+    if call.options.form == "material":
+        return Geometry(alone)
+    lights = followed_lights(q.job(Plan("spatial", "", "", (), prunes), 1))
+    return Geometry(alone, "" if lights is None else lights.names[0])
 
 
 def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:

@@ -9,79 +9,124 @@ shape; the rest that this leaves does not depend on its size.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.compat import mesh_buffers, mesh_faces
 from ..core.memory import Memory, Slot
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from .contacts import Contact
 from .intersections import TriangleMesh
-from .segments import EdgeSet
+from .segments import EdgeSet, is_smooth
 from .solids import Ball, Solid, triangles
 from .topology import INVALID
 
 #: Sine of the angle between two faces from which one stands off the other.
 STANDS_OFF = 0.05
 
-#: Of an integrator: contacts with lights that have been looked at, by the names of the two.
-LOOKED_AT: Slot[dict[tuple[str, str], Contact]] = Slot(dict)
+#: Of an integrator: by the names of a light and of what touches it, the contact and whether they meet at an angle.
+ANGLES: Slot[dict[tuple[str, str], tuple[Contact, bool]]] = Slot(dict)
 
 
-def warn_about_material(job: Job, found: EdgeSet) -> None:
-    """Say that the material form is off where shapes touch, once: 10 to 14 % for a box that slides on or in a floor."""
-    if job.form != "material" or job.options.depth_limit < 3 or dr.flag(dr.JitFlag.FreezingScope):
+#: Of an integrator: by the name of a light that touches something, its arrays, and whether it is shaded smooth.
+BENT: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
+
+#: Cosine of the angle up to which a normal of a corner is that of its face.
+UNBENT = 1 - 1e-5
+
+
+@dataclass(frozen=True)
+class Touching:
+    """What shapes that touch, or cut into each other, ask for."""
+
+    lamps: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # an area light, and what it touches at an angle
+    movers: tuple[mi.Shape, mi.Shape] | None = None  # of which one moves against the other
+
+
+def touching(found: EdgeSet, memory: Memory) -> Touching:
+    """Of the edges that were found."""
+    return Touching(tuple(_touching_lamps(found, memory)), next(_moved_against(found), None))
+
+
+def warn_about_contacts(job: Job, contacts: Touching) -> None:
+    """Say what is off where these touch, once.
+
+    In the material form, the light from one to the other: 10 to 14 % for a box that slides on or in a floor. Of area
+    lights that are followed on their material (`followed_lights.py` says which are not) the emission: the derivative by
+    the camera is 10 to 15 % off for a cube of light in a floor, that of a box that sinks into a lamp 11 %.
+    """
+    if job.options.depth_limit < 2 or dr.flag(dr.JitFlag.FreezingScope):
         return
-    for a, b in _moved_against(found):
+    memory = job.call.memory
+    if contacts.movers is not None and job.form == "material" and job.options.depth_limit > 2:
+        a, b = contacts.movers
         warn_once(
             f"shapes '{a.id()}' and '{b.id()}' touch and move against each other: in the material form, which this "
             "integrator was asked for, the light that goes from one to the other where they meet is wrong (10 % of the "
             "derivative) and noisy; use form='spatial', or 'auto', which knows of contacts",
             UnsupportedWarning,
-            job.call.memory,
+            memory,
         )
-        return
-
-
-def warn_about_lamps(job: Job, found: EdgeSet) -> None:
-    """Name area lights that touch what they shine on, each pair once.
-
-    The emitted light is followed on the light's material in both forms: beside the curve where the two meet it has the
-    corner of the module's text, and what a mover covers or uncovers of the light is no edge of the terms that need it.
-    Of a cube of light in a floor, the derivative by the camera is 10 to 15 % off; of a box that sinks into a lamp 11 %.
-    """
-    if job.options.depth_limit < 2 or dr.flag(dr.JitFlag.FreezingScope):
-        return
-    for a, b in _touching_lamps(found, job.call.memory):
-        lamp, other = (a, b) if a.is_emitter() else (b, a)
+    for lamp, other in contacts.lamps:
+        if job.form == "spatial" and not shaded_smooth(lamp, memory):
+            continue
+        cure = "keep them apart by a hundredth of their size"
+        cure += " or give it face_normals" if shaded_smooth(lamp, memory) else ", or use form='spatial', or 'auto'"
         warn_once(
             f"the area light '{lamp.id()}' touches '{other.id()}' or cuts into it: where the two meet, the derivative "
             "of the light on it is wrong and noisy (15 % of the total if there is no other light), and so is what one "
-            "covers of the other if they move against each other; keep them apart by a hundredth of their size",
+            f"covers of the other if they move against each other; {cure}",
             UnsupportedWarning,
-            job.call.memory,
+            memory,
         )
 
 
-def _touching_lamps(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
-    """Pairs with a light that meet at an angle: a flat light on a ceiling, in its plane, does not shine on that.
+def shaded_smooth(lamp: mi.Shape, memory: Memory) -> bool:
+    """Do Mitsuba's weights of samples of the light follow other normals than those of its faces?"""
+    if not lamp.is_mesh() or not is_smooth(lamp):
+        return False
+    buffers = [dr.detach(buffer) for buffer in mesh_buffers(lamp)]
+    known = memory[BENT].get(lamp.id())
+    if known is None or [b.index for b in known[0]] != [b.index for b in buffers]:
+        known = (buffers, _bent(lamp))
+        memory[BENT][lamp.id()] = known
+    return known[1]
 
-    A contact that has been looked at before is left out: it is one and the same object until a mesh changes.
-    """
-    for c in found.contacts:
-        a, b = c.a.mesh, c.b.mesh
-        if c.a is c.b or not (a.is_emitter() or b.is_emitter()) or memory[LOOKED_AT].get((a.id(), b.id())) is c:
-            continue
-        memory[LOOKED_AT][a.id(), b.id()] = c
-        if _at_an_angle(c):
-            yield a, b
+
+def _bent(mesh: mi.Mesh) -> bool:
+    """Is a normal of a corner turned away from that of its face?"""
+    with dr.suspend_grad():
+        faces = mesh_faces(mesh)
+        a, b, c = (mesh.vertex_position(corner) for corner in faces)
+        n = dr.normalize(dr.cross(b - a, c - a))
+        return any(bool(dr.any(dr.dot(n, mesh.vertex_normal(corner)) < UNBENT)[0]) for corner in faces)
+
+
+def _touching_lamps(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs with a light that meet at an angle: a flat light on a ceiling, in its plane, does not shine on that."""
+    pairs = [(c.a.mesh, c.b.mesh) for c in found.contacts if c.a is not c.b and _with_lamp_at_an_angle(c, memory)]
     for first, second in found.junctions.pairs if found.junctions is not None else ():
-        a, b = _shape(first), _shape(second)
-        if first is not second and (a.is_emitter() or b.is_emitter()):
-            yield a, b
+        if first is not second:
+            pairs.append((_shape(first), _shape(second)))
+    for a, b in pairs:
+        yield from (pair for pair in ((a, b), (b, a)) if pair[0].is_emitter())
+
+
+def _with_lamp_at_an_angle(c: Contact, memory: Memory) -> bool:
+    """Is one of the two a light, off which the other stands? A contact is one object until a mesh changes."""
+    if not (c.a.mesh.is_emitter() or c.b.mesh.is_emitter()):
+        return False
+    key = (c.a.mesh.id(), c.b.mesh.id())
+    known = memory[ANGLES].get(key)
+    if known is None or known[0] is not c:
+        known = (c, _at_an_angle(c))
+        memory[ANGLES][key] = known
+    return known[1]
 
 
 def _at_an_angle(contact: Contact) -> bool:

@@ -25,7 +25,7 @@ from ..scene.grids import VALUES, blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
-from .contact_limits import warn_about_lamps, warn_about_material
+from .contact_limits import touching, warn_about_contacts
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import GridPlace, edge_shapes
@@ -62,6 +62,7 @@ def scene_edges(job: Job) -> EdgeTable:
     """Edges of all shapes, built once per render call; mesh topologies outlive it."""
     if job.shared[TABLE] is None:
         job.shared[TABLE] = edge_table(job)
+    warn_about_contacts(job, job.shared[TABLE].touching)
     return job.shared[TABLE]
 
 
@@ -78,8 +79,6 @@ def edge_table(job: Job) -> EdgeTable:
     balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
     straight = _edge_set(job, meshes, balls)
     warn_about_parting(job, straight.contacts)
-    warn_about_material(job, straight)
-    warn_about_lamps(job, straight)
     kinds, hidden = _between_faces(job, straight, meshes, overlapping, centre)
     curves = _analytic(job, analytic, centre)
     if curves is not None:
@@ -98,7 +97,7 @@ def edge_table(job: Job) -> EdgeTable:
         kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
-    return EdgeTable(tuple(kinds), hidden)
+    return EdgeTable(tuple(kinds), hidden, touching(straight, job.call.memory))
 
 
 def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:

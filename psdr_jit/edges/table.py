@@ -9,6 +9,7 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from .contact_limits import Touching
 from .kind import EdgeKind, OnEdge, Side, Sight
 from .location import EdgeLocation
 
@@ -21,6 +22,7 @@ class EdgeTable:
 
     kinds: tuple[EdgeKind, ...]
     buried: int = 0  # edges that are left out because no path can reach them
+    touching: Touching = Touching()
 
     @property
     def count(self) -> int:

@@ -16,8 +16,8 @@ sampling (both MIS partners estimate one integral, so they must move y alike):
 
     f(ω_y) · L_e(y→x_k) · G(x_k, y) |dA(y)/dA_0| / p
 
-An area light's outline then is no discontinuity of this term. Infinitely distant emitters keep the direction, delta
-emitters follow their own attached pose.
+An area light's outline then is no discontinuity of this term. Infinitely distant emitters keep the direction, and so do
+area lights that touch what they shine on (`edges/followed_lights.py`); delta emitters follow their own attached pose.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
+from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
 from ..paths.recording import GRAZING
 from ..plan.motion import Displacements
@@ -53,6 +54,7 @@ class SceneTraits:
     delta_lobes: bool  # where geometry moves, only the spatial flow follows them
     smooth_lights: bool  # smooth-shaded area lights, see `next_event`
     tubes: Tubes | None = None  # curves
+    followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
 
 
 class Flow(ABC):
@@ -121,10 +123,14 @@ def next_event(
     """
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
-    light, ω, value = emission_towards(si.p, nee.hit(dr.detach(si.p)), si.wavelengths, emitter, moves, active)
+    hit, resting = nee.hit(dr.detach(si.p)), active
+    if traits.followed is not None:
+        along = active & traits.followed.has(emitter, active)
+        resting = active & ~along
+    light, ω, value = emission_towards(si.p, hit, si.wavelengths, emitter, moves, resting)
     if traits.smooth_lights:
         n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
-        usable = active & light.is_valid() & (n_g > GRAZING) & (n_s > GRAZING)
+        usable = resting & light.is_valid() & (n_g > GRAZING) & (n_s > GRAZING)
         value *= dr.relative_grad(dr.select(usable, n_s / n_g, 1))
     if traits.delta_emitters:
         is_delta = active & nee.delta
@@ -133,6 +139,9 @@ def next_event(
         ds, value_delta = emitter.sample_direction(seen, mi.Point2f(0.5), is_delta)
         ω = dr.select(is_delta, ds.d, ω)
         value = dr.select(is_delta, value_delta, value)
+    if traits.followed is not None:
+        met = moves.surface(hit, mi.Ray3f(si.p, hit.d, 0, si.wavelengths), mi.RayFlags.All)
+        value = dr.select(along, emitter.eval(met, along), value)
     f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
     return dr.select(active, f * value * nee.mis_over_pdf(), 0)
 

@@ -9,7 +9,8 @@ discontinuities of this flow are left to the boundary terms.
 
 At a delta lobe the direction follows the arrival and the normal (`paths/delta_step.py`), and w_k is the lobe's value
 over its probability. Emission that is met there counts where the attached ray meets it, without a measure: no emitter
-sample could have found it, and the outline of the light is a discontinuity.
+sample could have found it, and the outline of the light is a discontinuity. So does emission of lights that touch what
+they shine on, at smooth lobes (`edges/followed_lights.py`).
 """
 
 from __future__ import annotations
@@ -45,16 +46,19 @@ class SpatialFlow(Flow):
         w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * inv_pdf
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
-        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits)
+        along = mi.Bool(False) if self.traits.followed is None else self.traits.followed.has(emitter, emits)
+        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along)
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
         onward = following.hit.d
         if self.traits.delta_lobes:
             is_delta = vertex.onward.delta
             step = delta_step(ctx, si, bsdf, onward, is_delta)
             onward = dr.select(is_delta, step.d, onward)
+            along |= is_delta
+            w, w_emission = (dr.select(is_delta, step.value * inv_pdf, smooth) for smooth in (w, w_emission))
+        if self.traits.delta_lobes or self.traits.followed is not None:
             ray = mi.Ray3f(si.p, onward, 0, si.wavelengths)
             met = moves.surface(following.hit, ray, mi.RayFlags.All)
-            value = dr.select(is_delta, emitter.eval(met, emits & is_delta), value)
-            w, w_emission = (dr.select(is_delta, step.value * inv_pdf, smooth) for smooth in (w, w_emission))
+            value = dr.select(along, emitter.eval(met, emits & along), value)
         L += dr.select(emits, w_emission * value * following.weight_emission, 0)
         return VertexTerms(si.p, onward, L, w)

@@ -20,6 +20,7 @@ from ..core.film_samples import FilmSamples
 from ..core.low_discrepancy import LaneSampler
 from ..core.memory import Slot
 from ..core.streams import Stream, stream_seed
+from ..edges.followed_lights import followed_lights
 from ..options import Options
 from ..paths.dry_walk import count_vertices, touches
 from ..paths.recording import PathRecords
@@ -169,7 +170,9 @@ def flow_of(job: Job) -> Flow:
     """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
     smooth_lights = any(s.is_emitter and s.smooth for s in facts.shapes)
-    traits = SceneTraits(facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes)
+    traits = SceneTraits(
+        facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes, followed_lights(job)
+    )
     if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows
         return RestingFlow(job.scene, traits)
     return FLOWS[job.form](job.scene, traits)

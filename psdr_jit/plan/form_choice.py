@@ -12,12 +12,15 @@ import mitsuba as mi
 from ..options import Options
 from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts
+from .plan import Geometry
 
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
 CONTACT = 0.02
 
 
-def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[tuple[str, ...], str]:
+def forms_to_try(
+    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry
+) -> tuple[tuple[str, ...], str]:
     """The forms that come into question, the safer one first, and the reason if there is one only."""
     if facts.geometry_moves and facts.has_delta_lobes:
         return ("spatial",), "directions follow mirrors and glass"
@@ -31,6 +34,8 @@ def forms_to_try(scene: mi.Scene, facts: SceneFacts, options: Options) -> tuple[
         return ("spatial",), "nothing moves, so the forms are the same"
     if options.depth_limit < 3:
         return ("spatial",), "light is scattered once at most, so the forms are the same"
+    if geometry.touched_lamp:
+        return ("spatial",), f"'{geometry.touched_lamp}' touches what it shines on"
     touching = _touching(scene, facts)
     if touching:
         return ("spatial",), f"{touching} touch and move against each other"

@@ -144,6 +144,7 @@ class Geometry:
     """Facts about shapes that need their vertices."""
 
     lone_convex: str = ""  # name of the only shape, if it is convex, opaque, and seen from outside
+    touched_lamp: str = ""  # name of an area light that touches what it shines on
 
 
 def with_edges(plan: Plan, counts: Mapping[str, EdgeCount]) -> Plan:

@@ -19,7 +19,7 @@ FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
 #: Seeds that were wrong once: a shadow thinner than the height at which rays start; a contact on a face seen edge-on.
-FOUND = (461, 704)
+FOUND = (461, 509, 544, 704)
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 

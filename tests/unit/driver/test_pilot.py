@@ -19,6 +19,7 @@ from psdr_jit.driver.prepare import prepare
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.options import Options
 from psdr_jit.plan.form_choice import forms_to_try
+from psdr_jit.plan.plan import Geometry
 from psdr_jit.plan.probe_motion import probe_motion
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.facts import analyse
@@ -145,9 +146,11 @@ def test_structural_rules(llvm, case):
     name, param, depth = case
     scene = scene_of(name)
     with also_enabled(scene, [param]):
-        forms, reason = forms_to_try(scene, analyse(scene), Options(max_depth=depth))
+        forms, reason = forms_to_try(scene, analyse(scene), Options(max_depth=depth), Geometry())
         assert forms == FORMS[case] and reason
-        assert forms_to_try(scene, analyse(scene), Options(max_depth=depth, form="material"))[0] == ("material",)
+        assert forms_to_try(scene, analyse(scene), Options(max_depth=depth, form="material"), Geometry())[0] == (
+            "material",
+        )
 
 
 # ------------------------------------------------------------------------------------------ in use

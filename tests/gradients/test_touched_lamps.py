@@ -1,0 +1,121 @@
+"""Area lights that touch what they shine on: emission is followed along directions (`edges/followed_lights.py`)."""
+
+from __future__ import annotations
+
+import warnings
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import adjoint_identity, fd, forward
+from variants import activate
+
+import psdr_jit
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.statistics import gain
+from psdr_jit.errors import UnsupportedWarning
+
+SEEDS, SPP, REFERENCE_SPP, EPS = 16, 512, 2048, 4e-3
+LARGEST_ERROR = 0.02  # of a gain: followed on their material, lights in these scenes give 0.7 to 0.9
+X, Y = (1, 0, 0), (0, 1, 0)
+
+
+def room(lamp: dict, **others: dict) -> mi.Scene:
+    """A floor, and a lamp in it or on it."""
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    look = T().look_at(origin=[3, 2.5, 2.4], target=[0, 0.3, 0], up=[0, 1, 0])
+    return mi.load_dict({
+        "type": "scene", "camera": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(3),
+                  "bsdf": {"type": "diffuse", "reflectance": 0.7}},
+        "lamp": lamp, **others,
+    }, optimize=False)  # fmt: skip
+
+
+def cube(x: float, y: float, z: float, side: float, **more: dict) -> dict:
+    to_world = mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 1, 0], 30).scale(side / 2)
+    return {"type": "cube", "to_world": to_world, **more}
+
+
+def glow(radiance: float | dict = 2.0) -> dict:
+    return {"type": "area", "radiance": radiance}
+
+
+def sunk(**others: dict) -> mi.Scene:
+    return room(cube(0, 0.3, 0, 1, emitter=glow()), **others)
+
+
+def block(x: float) -> dict:
+    return cube(x, 0.25, 0.3, 0.5, bsdf={"type": "diffuse", "reflectance": 0.6})
+
+
+def mirror() -> dict:
+    T = mi.ScalarTransform4f
+    to_world = T().translate([-1, 0.5, -1]).rotate([0, 1, 0], 40).scale(0.9)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "twosided", "of": {"type": "conductor"}}}
+
+
+def picture() -> mi.Scene:
+    """A painted light that stands on the floor."""
+    to_world = mi.ScalarTransform4f().translate([-0.6, 0.5, 0]).rotate([0, 1, 0], 70).scale(0.5)
+    black = {"type": "twosided", "of": {"type": "diffuse"}}
+    checks = {"type": "checkerboard", "color0": 0.5, "color1": 3.0, "to_uv": mi.ScalarTransform4f().scale(3)}
+    return room({"type": "rectangle", "to_world": to_world, "bsdf": black, "emitter": glow(checks)})
+
+
+def ball() -> mi.Scene:
+    return room({"type": "sphere", "center": [0, 0.2, 0], "radius": 0.5, "emitter": glow()})
+
+
+CASES = {  # scene, parameter, direction, depth
+    "camera": (sunk, "camera.to_world", X, 2),
+    "lamp-slides": (sunk, "lamp.vertex_positions", X, 3),
+    "lamp-rises": (sunk, "lamp.vertex_positions", Y, 2),
+    "ball-rises": (ball, "lamp.to_world", Y, 2),
+    "shadow": (lambda: sunk(block=block(0.9)), "block.vertex_positions", X, 3),
+    "block-in-lamp": (lambda: sunk(block=block(0.6)), "block.vertex_positions", X, 3),
+    "painted": (picture, "camera.to_world", X, 3),
+    "in-a-mirror": (lambda: sunk(mirror=mirror()), "lamp.vertex_positions", X, 3),
+}
+
+
+@pytest.fixture
+def mono() -> str:
+    return activate("llvm_ad_mono")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_against_finite_differences(mono, case):
+    make, param, direction, depth = CASES[case]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UnsupportedWarning)
+        motion = perturb(make(), param, direction)
+        spec = {"type": "psdr_path", "max_depth": depth, "rr_depth": 99}
+        ours = forward(motion, spec, SEEDS, SPP)
+    reference = fd(motion, spec, EPS, 2 * SEEDS, REFERENCE_SPP)
+    found = gain(ours, reference[0::2], reference[1::2])
+    assert found.stderr < LARGEST_ERROR
+    assert abs(found.value - 1) < max(LARGEST_ERROR, 3 * found.stderr)
+
+
+@pytest.mark.parametrize("case", ["lamp-slides", pytest.param("in-a-mirror", marks=pytest.mark.slow)])
+def test_backward_is_the_transpose(mono, case):
+    make, param, _, depth = CASES[case]
+    integrator = mi.load_dict({"type": "psdr_path", "max_depth": depth})
+    forward_dot, backward_dot, w, Jv = adjoint_identity(make(), param, integrator)
+    assert abs(forward_dot - backward_dot) < 1e-4 * w * Jv
+
+
+def test_the_plan_says_so_and_material_form_warns(mono):
+    scene = sunk()
+    plan = psdr_jit.make_plan(scene, ["lamp.vertex_positions"], integrator={"type": "psdr_path", "max_depth": 2})
+    assert plan.form == "spatial" and plan.term("indirect").runs and "'lamp'" in plan.term("indirect").reason
+    apart = room(cube(0, 0.7, 0, 1, emitter=glow()))
+    plan = psdr_jit.make_plan(apart, ["lamp.vertex_positions"], integrator={"type": "psdr_path", "max_depth": 2})
+    assert not plan.term("indirect").runs
+    motion = perturb(scene, "lamp.vertex_positions", X)
+    with pytest.warns(UnsupportedWarning, match="'lamp' touches 'floor'"):
+        image = forward(motion, {"type": "psdr_path", "max_depth": 2, "form": "material"}, 1, 4)
+    assert np.isfinite(image).all()
