@@ -30,6 +30,7 @@ from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
+from ..scene.shared_texcoords import warn_about_shared_texcoords
 from ..scene.stale_normals import warn_about_stale_normals
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
@@ -94,6 +95,7 @@ def prepare(call: Call) -> Prepared:
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
     require_supported(facts, call.memory)
+    warn_about_shared_texcoords(call.scene, facts, call.memory)
     if call.mode == "backward":
         warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())

@@ -135,7 +135,7 @@ SUPPORT = (
     Row("perspective, thin lens, orthographic sensor", "yes", ""),
     Row("batch sensor", "yes", "its sensors are rendered one by one, uncropped; `sample_border` needs equal filters"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
-    Row("area, constant, environment map", "yes", ""),
+    Row("area, constant, environment map", "yes", "painted area lights that share texture coordinates: warning"),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),

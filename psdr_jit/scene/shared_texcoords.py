@@ -1,0 +1,59 @@
+"""Painted area lights of which several points have the same texture coordinates.
+
+Mitsuba 3.9 chooses points of a light with a texture by their place in the texture, and takes the first point of the
+shape that it finds there for the only one. Of a `cube`, whose faces all show the whole texture, one face is sampled:
+the image of `path` itself is wrong, and its derivative has no value to compare with.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, texcoords_buffer
+from ..core.memory import Memory, Slot
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+from .facts import SceneFacts
+
+#: By how much the faces may cover their part of the texture more than once, relative to its size: rounding.
+TOLERANCE = 1e-3
+
+#: Of an integrator: by the name of a light, its arrays, and whether its faces overlap in the texture.
+OVERLAPS: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
+
+
+def warn_about_shared_texcoords(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
+    """Name painted lights whose faces, taken together, are larger than the part of the texture that they show."""
+    if dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read
+        return
+    shapes = scene.shapes()
+    for emitter in facts.emitters:
+        if emitter.plugin != "area" or not emitter.varies or emitter.shape < 0:
+            continue
+        shape, index = facts.shapes[emitter.shape], facts.shapes[emitter.shape].index
+        if shape.is_mesh and shape.has_texcoords and index >= 0 and _overlap(shapes[index], memory):
+            warn_once(
+                f"the area light '{shape.name}' has a texture, and several of its points have the same texture "
+                "coordinates: Mitsuba samples one of them only, so that the image itself is wrong; give every point a "
+                "place of its own in the texture, or make a light of each face",
+                UnsupportedWarning,
+                memory,
+            )
+
+
+def _overlap(mesh: mi.Mesh, memory: Memory) -> bool:
+    buffers = [dr.detach(texcoords_buffer(mesh)), dr.detach(faces_buffer(mesh))]
+    known = memory[OVERLAPS].get(mesh.id())
+    if known is None or [b.index for b in known[0]] != [b.index for b in buffers]:
+        known = (buffers, _covers_twice(*(np.array(b) for b in buffers)))
+        memory[OVERLAPS][mesh.id()] = known
+    return known[1]
+
+
+def _covers_twice(texcoords: np.ndarray, faces: np.ndarray) -> bool:
+    uv = texcoords.reshape(-1, 2).astype(float)
+    a, b, c = (uv[faces.reshape(-1, 3)[:, corner]] for corner in range(3))
+    area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2
+    return bool(area > np.prod(uv.max(0) - uv.min(0)) * (1 + TOLERANCE))

@@ -1,0 +1,31 @@
+"""Painted lights whose points share texture coordinates are named, and no others."""
+
+from __future__ import annotations
+
+import warnings
+
+import mitsuba as mi
+import pytest
+
+from psdr_jit.core.memory import Memory
+from psdr_jit.scene.facts import analyse
+from psdr_jit.scene.shared_texcoords import warn_about_shared_texcoords
+
+PAINTED = {"type": "checkerboard"}
+CASES = {"cube-painted": ("cube", PAINTED, True), "cube-plain": ("cube", 1.0, False),
+         "rectangle-painted": ("rectangle", PAINTED, False), "sphere-painted": ("sphere", PAINTED, False)}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_who_is_named(llvm, case):
+    kind, radiance, named = CASES[case]
+    scene = mi.load_dict({"type": "scene", "lamp": {"type": kind, "emitter": {"type": "area", "radiance": radiance}},
+                          "camera": {"type": "perspective"}})  # fmt: skip
+    memory, said = Memory(), []
+    for _ in range(2):  # the second time it is known, and has been said
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            warn_about_shared_texcoords(scene, analyse(scene), memory)
+        said.append([str(w.message) for w in found])
+    assert [len(texts) for texts in said] == [int(named), 0]
+    assert all("'lamp'" in text for text in said[0])
