@@ -10,6 +10,7 @@ import gc
 import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import takewhile
@@ -151,7 +152,6 @@ class Engine:
     @contextmanager
     def _named(self) -> Iterator[None]:
         """Turn what Dask raises into typed errors."""
-        from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 
         try:
@@ -164,7 +164,7 @@ class Engine:
                 f"a unit of work ended {count} workers, at last '{last}': does it need more memory than they have? "
                 "Lower spp or record_mib, or give them more"
             ) from error
-        except (FutureCancelledError, OSError, TimeoutError) as error:
+        except (CancelledError, OSError, TimeoutError) as error:
             raise ClusterError(
                 f"the scheduler at '{self.client.scheduler.address}' is gone ({type(error).__name__}): start it anew "
                 "and run this again"

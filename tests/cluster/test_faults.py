@@ -61,7 +61,7 @@ def test_work_that_ends_every_worker_is_not_repeated_for_ever(scene, source, two
 
     with pytest.raises(ClusterError, match=r"ended \d+ workers, at last 'tcp://.*more memory.*Lower spp"):
         list(engine.Engine(two, scene, source).ordered(too_much, [()]))
-    two.wait_for_workers(2, timeout=60)
+    two.wait_for_workers(2, timeout=240)
     assert psdr_jit.gradient(scene, BOX, **MOVE, client=two, source=source).total.any(), "others go on"
 
 
