@@ -70,6 +70,11 @@ def connected(address: str) -> Iterator[Any]:
         client = distributed.Client(address)
     except (OSError, ValueError) as error:  # ValueError: no address at all
         raise ClusterError(f"no scheduler answers at '{address}' ({error}): start one with 'dask scheduler'") from error
+    except TypeError as error:  # so says Dask of a TLS address without a certificate
+        raise ClusterError(
+            f"'{address}' wants a certificate for TLS: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, __CLIENT__CERT and "
+            "__CLIENT__KEY (psdr_jit/cluster/README.md)"
+        ) from error
     with client:
         yield client
 
