@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import numpy as np
 import pytest
@@ -188,3 +189,17 @@ def test_demo_cannot_make_its_folder(capsys):
     with open("file", "w"):
         pass
     assert "cannot make the folder" in refused(capsys, "demo", "--out", "file/sub")
+
+
+@pytest.mark.parametrize("inside, colours", [('<integrator type="path" name="image"/>', "RGB"), ("", "")])
+def test_channels_of_mitsubas_aov_have_their_names(tmp_path, inside, colours):
+    text = open(CARD, encoding="utf-8").read()
+    own = re.search(r"<integrator.*?</integrator>", text, re.DOTALL)[0]
+    aov = f'<integrator type="aov"><string name="aovs" value="dd:depth,nn:sh_normal"/>{inside}</integrator>'
+    scene = tmp_path / "aov.xml"
+    mesh = str(scene_io.shipped_scene("meshes/card.obj"))
+    scene.write_text(text.replace(own, aov).replace("meshes/card.obj", mesh), encoding="utf-8")
+    assert main(["render", str(scene), "-D", "res=8", "--spp", "1", "-o", "a.exr", "--quiet"]) == 0
+    channels = {name for name in images.read_exr("a.exr") if not name.startswith("primal.")}
+    assert channels == {*colours, "dd.T", "nn.X", "nn.Y", "nn.Z"}
+    assert main(["render", str(scene), "-D", "res=8", "--spp", "1", "-o", "a.png", "--quiet"]) == 0
