@@ -69,7 +69,8 @@ def connected(address: str) -> Iterator[Any]:
     try:
         client = distributed.Client(address)
     except (OSError, ValueError) as error:  # ValueError: no address at all
-        raise ClusterError(f"no scheduler answers at '{address}' ({error}): start one with 'dask scheduler'") from error
+        raise ClusterError(f"no scheduler answers at '{address}' ({error}): start one with 'dask scheduler', "
+                           "and give the address that it prints, such as tcp://10.0.0.1:8786") from error  # fmt: skip
     except TypeError as error:  # so says Dask of a TLS address without a certificate
         raise ClusterError(
             f"'{address}' wants a certificate for TLS: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, __CLIENT__CERT and "

@@ -203,3 +203,16 @@ def test_channels_of_mitsubas_aov_have_their_names(tmp_path, inside, colours):
     channels = {name for name in images.read_exr("a.exr") if not name.startswith("primal.")}
     assert channels == {*colours, "dd.T", "nn.X", "nn.Y", "nn.Z"}
     assert main(["render", str(scene), "-D", "res=8", "--spp", "1", "-o", "a.png", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("more, words", [
+    (["-D", "size=3"], ("no <default name=\"size\">", "it has 'res'")),
+    (["--integrator", "psdr"], ("no integrator 'psdr'", "psdr_path and psdr_bdpt")),
+])  # fmt: skip
+def test_names_that_are_not_there_are_answered_with_those_that_are(capsys, more, words):
+    said = refused(capsys, "gradient", CARD, *MOVE, *more)
+    assert all(word in said for word in words) and "Plugin" not in said
+
+
+def test_reports_of_other_files_are_refused(capsys):
+    assert "psdr gradient has written, or the folder of psdr optimize" in refused(capsys, "report", CARD)
