@@ -44,7 +44,7 @@ OPTIMISATIONS = (
 ITERATIONS = "What an iteration consists of, at 256 x 256 pixels and 16 samples per pixel (medians):"
 SCALING = (
     "Efficiency of a simulated cluster: workers that wait instead of computing, all in one process "
-    "(`benchmarks/scaling.py`)."
+    "(`benchmarks/scaling.py`). Of local processes: their throughput divided by that of one process on all cores."
 )
 QUARTILES = "Medians, and quartiles in brackets."
 WHAT_IS_WHAT = (
@@ -192,13 +192,14 @@ def timing_table(found: list[dict[str, Any]]) -> str:
 
 
 def scaling_table(found: list[dict[str, Any]]) -> str:
-    """Median efficiency by number of workers, the least of the runs, and processor time."""
+    """Median efficiency by number of workers, the least of the runs, and processor time where work is only waited for.
+    """
     lines = ["| work | workers | efficiency | least | processor time of a run [s] |", "|---|---|---|---|---|"]
     for row in found:
         for count, e in row["efficiency"].items():
-            busy = row["cpu_seconds"][count]["median"]
+            busy = f"{row['cpu_seconds'][count]['median']:.2f}" if "cpu_seconds" in row else ""
             what = f"{row['case']}, {row['method']}"
-            lines.append(f"| {what} | {count} | {e['median']:.2f} | {e['min']:.2f} | {busy:.2f} |")
+            lines.append(f"| {what} | {count} | {e['median']:.2f} | {e['min']:.2f} | {busy} |")
     return "\n".join(lines)
 
 

@@ -2,6 +2,7 @@
 
     python -m benchmarks.scaling                        (six minutes; append to benchmarks/results/scaling.jsonl)
     python -m benchmarks.scaling --workers 64 --out -   (print the row instead)
+    python -m benchmarks.scaling --local 2              (real work by so many processes here, beside this one alone)
 
 64 units of work of 2 s, one a view, are handed out by Dask to 1, 2, 4, ... 64 workers, each with what a unit of an
 optimisation has: the state of its scene and an image there, an image back. Efficiency is the waiting that there is to
@@ -26,13 +27,14 @@ import numpy as np
 
 import psdr_jit
 from benchmarks import rows
-from psdr_jit.cluster.engine import LOOPBACK, Engine, require_dask
+from psdr_jit.cluster.engine import LOOPBACK, Engine, local, require_dask
 from psdr_jit.scene import io as scene_io
 
 BENCH = "scaling"
 SCENE, DEFAULTS = "emissive_card.xml", {"res": 16}
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
 VIEWS, SECONDS, RES = 64, 2.0, 64
+WARM_UP = 3  # runs of local workers, until each has met each kind of unit
 RUNS, LONG = 5, 30.0  # runs per number of workers; what takes longer [s] runs once
 QUIET_WORKERS = {
     "distributed.worker.profile.enabled": False,
@@ -95,6 +97,30 @@ def row(workers: list[int], views: int, seconds: float, res: int) -> dict[str, A
             "cpu_seconds": busy}  # fmt: skip
 
 
+def local_row(workers: int, res: int = 128, spp: int = 32, seeds: int = 8) -> dict[str, Any]:
+    """Derivatives by processes of this machine beside this process, which rests meanwhile: ratio of throughputs.
+
+    The two take turns; their first runs, which load scenes and kernels, are dropped. So is the start of the workers,
+    which a run of minutes does not see.
+    """
+    path, defaults = str(scene_io.shipped_scene("cbox.xml")), {"res": res, "max_depth": 4}
+    scene, source = scene_io.load_scene(path, **defaults), psdr_jit.SceneFile(path, defaults)
+    times: dict[str, list[float]] = {"alone": [], "workers": []}
+    with local(workers) as client:
+        who = {"alone": {}, "workers": {"client": client, "source": source}}
+        for turn in range(WARM_UP + RUNS):
+            for name, given in who.items():
+                start = time.perf_counter()
+                psdr_jit.gradient(scene, "small-box.vertex_positions", (1, 0, 0), spp=spp, seeds=seeds, **given)
+                if turn >= WARM_UP:
+                    times[name].append(time.perf_counter() - start)
+    alone = rows.summary(times["alone"])
+    ratios = [alone["median"] / seconds for seconds in times["workers"]]
+    return {"bench": BENCH, "case": "cbox, local processes", "method": f"{seeds} seeds, {spp} spp", "seeds": RUNS,
+            "settings": {**defaults, "spp": spp, "seeds": seeds}, "efficiency": {str(workers): rows.summary(ratios)},
+            "seconds": {name: rows.summary(taken) for name, taken in times.items()}}  # fmt: skip
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", default=str(rows.RESULTS / f"{BENCH}.jsonl"), help="file to append to, - to print")
@@ -102,11 +128,13 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--seconds", type=float, default=SECONDS, help="of a unit (default: %(default)g)")
     parser.add_argument("--res", type=int, default=RES, help="pixels across an image (default: %(default)s)")
+    parser.add_argument("--local", type=int, metavar="N", help="measure N processes of this machine instead")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
     args = parser.parse_args()
     scene_io.use_variant(args.variant)
     where = rows.circumstances()
-    found = {**row(args.workers, args.views, args.seconds, args.res), **where}
+    found = local_row(args.local) if args.local else row(args.workers, args.views, args.seconds, args.res)
+    found |= where
     if args.out == "-":
         print(json.dumps(found, default=float))
     else:
