@@ -10,6 +10,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib import resources
 from pathlib import Path
 from shutil import which
 from typing import Any
@@ -179,6 +180,7 @@ def test_jobs_written_by_dask_jobqueue(slurm, scene, source):
 def test_what_kubernetes_gets(monkeypatch):
     """As far as one machine allows: the manifest holds what the page says, and is what the operator's schema wants."""
     operator = pytest.importorskip("dask_kubernetes.operator")
+    yaml, jsonschema = pytest.importorskip("yaml"), pytest.importorskip("jsonschema")
     made: dict[str, Any] = {}
 
     class Cluster:
@@ -187,6 +189,9 @@ def test_what_kubernetes_gets(monkeypatch):
 
     monkeypatch.setattr(operator, "KubeCluster", Cluster)
     exec(compile(snippet("make_cluster_spec").split("with ")[0] + "KubeCluster(custom_cluster_spec=spec)", "x", "exec"))
+    resource = "operator/deployment/helm/dask-kubernetes-operator/crds/daskcluster.yaml"
+    wanted = yaml.safe_load((resources.files("dask_kubernetes") / resource).read_text(encoding="utf-8"))
+    jsonschema.validate(made, wanted["spec"]["versions"][0]["schema"]["openAPIV3Schema"])
     (container,) = made["spec"]["worker"]["spec"]["containers"]
     assert container["args"][:4] == ["dask", "worker", "--nthreads", "1"]
     assert {"name": "PSDR_THREADS", "value": "8"} in container["env"]
