@@ -80,6 +80,7 @@ BOX, BALL, IOR = "box.vertex_positions", "ball.to_world", "ball.bsdf.eta"
 CAMERA_SIZE = 4.3  # [units] from the camera to the middle of the boxes
 SHADOW_SIZE = 3.0  # [units] from the lamp to the floor
 SPOT, CAUSTIC_SIZE = "lamp.to_world", 3.3  # [units] from the spotlight to the floor
+LEFT, RIGHT, BRIGHTNESS = "left:lamp.intensity.value", "right:lamp.intensity.value", 10.0
 MIRROR_SIZE = 3.0  # [units] from the mirror to the end of what it shows
 
 EXAMPLES = {
@@ -112,6 +113,12 @@ EXAMPLES = {
         "caustic",
         named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
         {"ior": below(0.01), "spot": below(0.01)},
+    ),
+    "lamps": Example(
+        "lamps",
+        named(distance=offset(BLOCKER, "distance", SHADOW_SIZE), angle_degrees=offset(BLOCKER, "angle_degrees"),
+              left=offset(LEFT, "rms", BRIGHTNESS), right=offset(RIGHT, "rms", BRIGHTNESS)),
+        {"distance": below(0.01), "angle_degrees": below(0.5), "left": below(0.01), "right": below(0.01)},
     ),
 }
 

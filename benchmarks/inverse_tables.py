@@ -11,7 +11,8 @@ OVERHEAD = "overhead: "  # begins the names of cases that take the time of an it
 
 UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer": "Chamfer distance",
          "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size",
-         "ior": "refractive index"}  # fmt: skip
+         "ior": "refractive index", "left": "left lamp: relative brightness",
+         "right": "right lamp: relative brightness"}  # fmt: skip
 
 
 def outcome_table(found: list[dict[str, Any]]) -> str:

@@ -42,6 +42,10 @@ OPTIMISATIONS = (
     "iterations as fit into it."
 )
 ITERATIONS = "What an iteration consists of, at 256 x 256 pixels and 16 samples per pixel (medians):"
+SCALING = (
+    "Efficiency of a simulated cluster: workers that wait instead of computing, all in one process "
+    "(`benchmarks/scaling.py`). Of local processes: their throughput divided by that of one process on all cores."
+)
 QUARTILES = "Medians, and quartiles in brackets."
 WHAT_IS_WHAT = (
     "Made by `psdr bench --report` from the rows beside this file. Errors are relative to the root mean square of the "
@@ -92,6 +96,7 @@ def sections(of: dict[str, list[dict[str, Any]]], folder: Path) -> list[tuple[st
         ("Cost", costs, lambda: (shown("cost.png"),)),
         ("Backward passes", passes, lambda: (
             timing_table([row for row in passes if "wall_ms" in row]), QUARTILES)),
+        ("Workers", of.get("scaling"), lambda: (SCALING, scaling_table(of["scaling"]))),
         ("Checks against finite differences", of.get("checks"), lambda: (check_table(of["checks"]),)),
         ("Convergence", of.get("convergence"), lambda: (convergence_table(of["convergence"]),)),
         ("References, every row", of.get("references"), lambda: (
@@ -183,6 +188,18 @@ def timing_table(found: list[dict[str, Any]]) -> str:
         ratio = f"{row['wall_ms']['median'] / base['wall_ms']['median']:.2f}" if base else "-"
         times = [f"{t['median']:.0f} ({t['q1']:.0f} to {t['q3']:.0f})" for t in (row["wall_ms"], row["kernel_ms"])]
         lines.append(f"| {describe(row)} | {row['method']} | {times[0]} | {times[1]} | {ratio} |")
+    return "\n".join(lines)
+
+
+def scaling_table(found: list[dict[str, Any]]) -> str:
+    """Median efficiency by number of workers, the least of the runs, and processor time where work is only waited for.
+    """
+    lines = ["| work | workers | efficiency | least | processor time of a run [s] |", "|---|---|---|---|---|"]
+    for row in found:
+        for count, e in row["efficiency"].items():
+            busy = f"{row['cpu_seconds'][count]['median']:.2f}" if "cpu_seconds" in row else ""
+            what = f"{row['case']}, {row['method']}"
+            lines.append(f"| {what} | {count} | {e['median']:.2f} | {e['min']:.2f} | {busy} |")
     return "\n".join(lines)
 
 

@@ -83,7 +83,7 @@ def write(args: argparse.Namespace, result: Any, exr: Path, png: Path) -> None:
 
     images.write_exr(exr, result.layers(), result.metadata(), result.aovs)
     title = f"d image / d {result.param}\n{result.direction}"
-    images.write_derivative_png(png, result.total, title)
+    images.write_derivative_png(png, images.colours(result.total, result.aovs), title)
     if not args.quiet:
         print(describe(result, exr, png))
 

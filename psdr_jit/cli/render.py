@@ -39,14 +39,15 @@ def run(args: argparse.Namespace) -> int:
     import mitsuba as mi
 
     from psdr_jit.core.film import require_samples
-    from psdr_jit.derivative.integrator_specs import aovs_of, to_image
+    from psdr_jit.derivative.integrator_specs import aovs_of, names_of_aovs, to_image
 
     require_samples(scene.sensors()[args.sensor], args.spp or 0)
     image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))
+    aovs = aovs_of(scene.integrator()) or names_of_aovs(scene, args.sensor, image.shape[-1])
     if output.suffix.lower() == ".exr":
-        images.write_exr(output, {"primal": image}, aovs=aovs_of(scene.integrator()))
+        images.write_exr(output, {"primal": image}, aovs=aovs)
     else:
-        images.write_panels(output, [("primal", Path(args.scene).name, image)])
+        images.write_panels(output, [("primal", Path(args.scene).name, images.colours(image, aovs))])
     if not args.quiet:
         print(f"wrote {output}")
     return 0

@@ -9,17 +9,9 @@ Processes of one machine need nothing else: `psdr gradient ... --workers 2`, `ps
         psdr_jit.gradient(scene, "small-box.vertex_positions", (1, 0, 0), client=client, source=source)
 
 where `scene` was loaded from that file with these defaults; what was changed in it since is sent along. So do
-`check_gradient` and `optimize`. Any other client of Dask will do. On several machines:
-
-    dask scheduler --host 10.0.0.1                          # without --host it listens on every interface
-    dask worker tcp://10.0.0.1:8786 --nthreads 1            # on each machine; one task at a time, on all its cores
-    PSDR_THREADS=8 dask worker tcp://10.0.0.1:8786 --nthreads 1 --nworkers 4        # or several that share them
-    CUDA_VISIBLE_DEVICES=0 dask worker tcp://10.0.0.1:8786 --nthreads 1             # one per GPU, --variant cuda_ad_rgb
-    psdr gradient scenes/cbox.xml ... --scheduler tcp://10.0.0.1:8786
-
-These are also what a job under SLURM (`srun dask worker ...`) or Kubernetes has to run; Dask's own `dask-jobqueue` and
-`dask-kubernetes` write such jobs. For TLS give `distributed.Client(address, security=...)` as `client`. Workers read
-the scene file under the same path, or get it with `--send`, `SceneFile(..., send=True)`.
+`check_gradient` and `optimize`. Any other client of Dask will do: README.md in this folder tells how to start them on
+several machines, with TLS, by SLURM and by Kubernetes. Workers read the scene file under the same path, or get it with
+`--send`, `SceneFile(..., send=True)`.
 
 A worker that dies is replaced, its unit of work is done by another one, and the result is the same: sums are taken in a
 fixed order. A scheduler that dies, versions that differ, files that are missing are typed errors that name the machine.

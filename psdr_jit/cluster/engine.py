@@ -9,9 +9,11 @@ from __future__ import annotations
 import gc
 import pickle
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import drjit as dr
@@ -26,7 +28,8 @@ from psdr_jit.scene.names import traverse
 
 LOOPBACK = "127.0.0.1"
 PATIENCE = 60.0  # seconds to wait for a first worker
-SMALL = 1 << 17  # bytes of a scene's state that travel with every unit of work
+SMALL = 1 << 20  # bytes of a scene's state that travel with every unit of work
+MESSAGE = 1 << 23  # bytes of units that are handed out at once; of more Dask warns
 
 #: Digests of the parameters of files as they are, by variant and digest of the file.
 _AS_LOADED: dict[tuple[str, str], dict[str, bytes]] = {}
@@ -66,7 +69,13 @@ def connected(address: str) -> Iterator[Any]:
     try:
         client = distributed.Client(address)
     except (OSError, ValueError) as error:  # ValueError: no address at all
-        raise ClusterError(f"no scheduler answers at '{address}' ({error}): start one with 'dask scheduler'") from error
+        raise ClusterError(f"no scheduler answers at '{address}' ({error}): start one with 'dask scheduler', "
+                           "and give the address that it prints, such as tcp://10.0.0.1:8786") from error  # fmt: skip
+    except TypeError as error:  # so says Dask of a TLS address without a certificate
+        raise ClusterError(
+            f"'{address}' wants a certificate for TLS: set DASK_DISTRIBUTED__COMM__TLS__CA_FILE, __CLIENT__CERT and "
+            "__CLIENT__KEY (psdr_jit/cluster/README.md)"
+        ) from error
     with client:
         yield client
 
@@ -93,40 +102,66 @@ class Engine:
         """Let units see these values of parameters from now on."""
         place = replace(self._at_first, values={**self._at_first.values, **values})
         # With every unit, or, if large, once to each worker: as a task, not as scattered data, since Dask makes it anew
-        # where the worker that has it dies. It then prefers workers that have it, and takes a while to use all of them.
+        # where the worker that has it dies.
         small = len(pickle.dumps(place)) <= SMALL
         self._place = place if small else self.client.submit(_same, place, pure=False)
 
     @property
     def workers(self) -> int:
         """How many there are now."""
-        return max(1, len(self.client.scheduler_info(n_workers=-1)["workers"]))
+        return max(1, len(self._addresses()))
 
     def ordered(self, function: Callable[..., Any], units: Iterable[tuple]) -> Iterator[Any]:
         """`function(held, *unit)` for every unit, in order. Raises typed errors, of units those of the worker."""
         return together(function, [(self, unit) for unit in units])
 
-    def submit(self, function: Callable[..., Any], unit: tuple) -> Any:
-        """The future of a unit of work."""
-        return self.client.submit(worker.work, function, self._place, *unit, pure=False)
+    def hand_out(self, function: Callable[..., Any], units: Sequence[tuple]) -> list[Any]:
+        """The futures of units of work, in order."""
+        with self._named():
+            if isinstance(self._place, Place):
+                return self._map(function, units)
+            # Dask would give all units to the worker that has the state, and let others take of them after a while.
+            addresses = self._addresses()
+            futures: list[Any] = [None] * len(units)
+            for k, address in enumerate(addresses[: len(units)]):
+                share = slice(k, None, len(addresses))
+                futures[share] = self._map(function, units[share], workers=[address], allow_other_workers=True)
+            return futures
 
-    def finished(self, future: Any) -> Any:
-        """The result of a future, once it is there; warnings are said here."""
-        result, said = self._result(future)
-        self._warn(said)
-        return result
+    def _map(self, function: Callable[..., Any], units: Sequence[tuple], **where: Any) -> list[Any]:
+        """In as few messages as the sizes of units allow."""
+        count = len(units)
+        at_once = max(2, MESSAGE // len(pickle.dumps(units[0])))  # 1 would mean all to Dask
+        columns = [list(column) for column in zip(*units, strict=True)]
+        return self.client.map(worker.work, [function] * count, [self._place] * count, *columns, pure=False,
+                               batch_size=at_once, **where)  # fmt: skip
 
-    def forget(self, future: Any) -> None:
+    def _addresses(self) -> list[str]:
+        return list(self.client.scheduler_info(n_workers=-1)["workers"])
+
+    def finished(self, futures: Sequence[Any]) -> list[Any]:
+        """The results of the first future, once it is there, and of those after it that are there by then."""
+        from distributed import wait
+
+        with self._named():
+            wait(futures[0])
+            results = self.client.gather(list(takewhile(lambda future: future.done(), futures)))
+        for _, said in results:
+            self._warn(said)
+        return [result for result, _ in results]
+
+    def forget(self, futures: Sequence[Any]) -> None:
         """What nobody waits for any more."""
-        if self.client.status == "running":
-            future.cancel()
+        if futures and self.client.status == "running":
+            self.client.cancel(list(futures))
 
-    def _result(self, future: Any) -> Any:
-        from distributed.client import FutureCancelledError
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Turn what Dask raises into typed errors."""
         from distributed.scheduler import KilledWorker
 
         try:
-            return future.result()
+            yield
         except PsdrError:
             raise
         except KilledWorker as error:
@@ -135,7 +170,7 @@ class Engine:
                 f"a unit of work ended {count} workers, at last '{last}': does it need more memory than they have? "
                 "Lower spp or record_mib, or give them more"
             ) from error
-        except (FutureCancelledError, OSError, TimeoutError) as error:
+        except (CancelledError, OSError, TimeoutError) as error:
             raise ClusterError(
                 f"the scheduler at '{self.client.scheduler.address}' is gone ({type(error).__name__}): start it anew "
                 "and run this again"
@@ -163,15 +198,20 @@ class Engine:
 
 def together(function: Callable[..., Any], units: Iterable[tuple[Engine, tuple]]) -> Iterator[Any]:
     """`function(held, *unit)` for units with scenes of their own, all handed out at once; see `Engine.ordered`."""
-    futures = [(engine, engine.submit(function, unit)) for engine, unit in units]
+    units = list(units)
+    handed = {}
+    for engine in dict.fromkeys(engine for engine, _ in units):
+        handed[engine] = iter(engine.hand_out(function, [unit for own, unit in units if own is engine]))
+    left = [(engine, next(handed[engine])) for engine, _ in units]
     try:
-        while futures:
-            engine, future = futures[0]
-            yield engine.finished(future)
-            futures.pop(0)  # workers may forget it
+        while left:
+            engine = left[0][0]
+            results = engine.finished([future for _, future in takewhile(lambda pair: pair[0] is engine, left)])
+            del left[: len(results)]  # workers may forget them
+            yield from results
     finally:
-        for engine, future in futures:
-            engine.forget(future)
+        for engine in handed:
+            engine.forget([future for own, future in left if own is engine])
 
 
 def _same(place: Place) -> Place:

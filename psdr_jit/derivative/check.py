@@ -30,6 +30,7 @@ from psdr_jit.derivative.sampler import DerivativeSampler, differentiable
 from psdr_jit.derivative.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
 from psdr_jit.errors import OptionError
 from psdr_jit.options import require_count
+from psdr_jit.paths.aovs import Aovs
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 
@@ -73,6 +74,7 @@ class CheckResult:
     direction: str
     estimate: np.ndarray = field(repr=False)    # mean derivative image, (H, W, C)
     reference: np.ndarray = field(repr=False)
+    aovs: tuple[str, ...] = ()  # names of the last channels, those that are no colours
 
     @property
     def passed(self) -> bool:
@@ -229,7 +231,8 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
             verdict, reference = retry, finer
     return CheckResult(verdict, estimate.seeds, 2 * reference.seeds, spp, reference.spp, reference.eps, block,
                        time.perf_counter() - start, tuple(terms) or ("all of the given integrator",),
-                       param.name, param.label, estimate.images.mean(), reference.result(block).mean)
+                       param.name, param.label, estimate.images.mean(), reference.result(block).mean,
+                       tuple(Aovs.parse(spec.get("aovs", "")).channels))
 
 
 def _noted(limit: float, report: Report) -> Callable[[float, Verdict], None]:

@@ -21,7 +21,7 @@ from psdr_jit.errors import OptionError
 ROBUST_PERCENTILE = 99.0    # of |value| where not zero: the end of the colour scale
 COLOUR_MAP = "RdBu_r"       # red positive, blue negative, white zero
 PROBE = 4096    # bytes that a folder must have room for: a disk that is full takes empty files
-CHANNELS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+CHANNELS = {0: (), 1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def check_writable(path: str | os.PathLike) -> Path:
@@ -86,6 +86,13 @@ def channel_names(count: int, aovs: Sequence[str] = ()) -> tuple[str, ...]:
     """Names of `count` channels, of which the last are `aovs`: what is no colour must not pass for alpha."""
     count -= len(aovs)
     return (*CHANNELS.get(count, ("R", "G", "B", *(f"C{k}" for k in range(3, count)))), *aovs)
+
+
+def colours(image: np.ndarray, aovs: Sequence[str] = ()) -> np.ndarray:
+    """What there is to see of an image (H, W, C) whose last channels are `aovs`: the others, or all if there are none.
+    """
+    image = np.asarray(image)
+    return image[..., : image.shape[-1] - len(aovs)] if image.ndim == 3 and image.shape[-1] > len(aovs) else image
 
 
 def _channels(prefix: str, image: np.ndarray, aovs: Sequence[str]) -> dict[str, np.ndarray]:
@@ -190,9 +197,9 @@ def srgb(image: np.ndarray) -> np.ndarray:
 
 
 def grey(image: np.ndarray) -> np.ndarray:
-    """Mean of the colour channels (H, W)."""
+    """Mean of the colour channels (H, W): of red, green and blue, or luminance beside its alpha."""
     image = np.asarray(image, dtype=np.float64)
-    return image if image.ndim == 2 else image[..., : min(3, image.shape[-1])].mean(-1)
+    return image if image.ndim == 2 else image[..., : 3 if image.shape[-1] >= 3 else 1].mean(-1)
 
 
 def _replaced(path: str | os.PathLike, write: Callable[[str], None]) -> Path:

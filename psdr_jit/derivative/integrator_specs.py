@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from psdr_jit.core.film import black
 from psdr_jit.driver.aovs import AovChannels
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
@@ -29,6 +30,9 @@ OURS = (DEFAULT_INTEGRATOR, "psdr_bdpt")
 
 # Mitsuba's own, for comparisons: term name, its sample budget
 PROJECTIVE_TERMS = (("interior", "sppc"), ("primary", "sppp"), ("secondary", "sppi"))
+
+UNKNOWN = "failed to instantiate unknown plugin"  # how Mitsuba begins to say so
+INSIDE = 4  # channels that Mitsuba's `aov` lists for the integrator in it: R, G, B, A
 
 # what the reference has to share with the integrator under test
 PATH_OPTIONS = ("max_depth", "rr_depth", "hide_emitters")
@@ -98,6 +102,9 @@ def build(spec: Mapping[str, Any]) -> Any:
     try:
         return mi.load_dict(given)
     except RuntimeError as error:
+        if UNKNOWN in str(error):
+            raise OptionError(f"there is no integrator '{spec.get('type')}': ours are {' and '.join(OURS)}, "
+                              "Mitsuba has others, such as prb") from error  # fmt: skip
         raise OptionError(f"integrator '{spec.get('type')}' cannot be made: {_last_line(error)}") from error
 
 
@@ -145,6 +152,18 @@ def aovs_of(integrator: Any) -> list[str]:
     """Names of the channels that one of our integrators renders behind those of the film, as `dd.T`."""
     own = getattr(integrator, "aovs", None)
     return own.aovs.channels if isinstance(own, AovChannels) else []
+
+
+def names_of_aovs(scene: Any, sensor: int, channels: int) -> list[str]:
+    """Names of the last of so many channels that Mitsuba's own `aov` has rendered; none where they do not add up.
+
+    It lists the four channels of the integrator inside as well, which are those of the film.
+    """
+    named = list(scene.integrator().aov_names())
+    if len(named) == channels:  # nothing inside
+        return named
+    own = channels - black(scene.sensors()[sensor].film()).shape[-1]
+    return named[len(named) - own :] if 0 < own == len(named) - INSIDE else []
 
 
 def _last_line(error: Exception) -> str:

@@ -24,6 +24,7 @@ def gradient_png(result: Any) -> bytes:
     if len(seen) > 1:  # a single one is the derivative itself
         panels += [("derivative", name, image) for name, image in seen.items()]
     rows = -(-len(panels) // COLUMNS)
+    panels = [(kind, title, images.colours(image, result.aovs)) for kind, title, image in panels]
     return images.png_bytes(images.panels_figure(panels, unit_of(result.direction), -(-len(panels) // rows)))
 
 
@@ -46,6 +47,7 @@ def check_png(result: Any) -> bytes:
     """Estimate, finite differences and what is between them, of a `CheckResult`."""
     panels = [("derivative", "estimate", result.estimate), ("derivative", "finite differences", result.reference),
               ("derivative", "estimate − finite differences", result.estimate - result.reference)]  # fmt: skip
+    panels = [(kind, title, images.colours(image, result.aovs)) for kind, title, image in panels]
     return images.png_bytes(images.panels_figure(panels, unit_of(result.direction)))
 
 

@@ -82,6 +82,13 @@ def _cannot(name: str) -> str:
     return f"parameter '{name}' has changed, and a scene file cannot say so"
 
 
+def _require_colours(name: str) -> None:
+    """Raises `UnsupportedError` where values are no colours that a file could hold."""
+    if mi.is_spectral:
+        raise UnsupportedError(f"{_cannot(name)}: spectral variants keep coefficients of colours; write it under an "
+                               "rgb variant")  # fmt: skip
+
+
 def _flat(value: Any) -> np.ndarray:
     """Its numbers, as the file has them."""
     found = to_numpy(value)
@@ -89,9 +96,7 @@ def _flat(value: Any) -> np.ndarray:
 
 
 def _colour(name: str, value: Any, place: Slot) -> Any:
-    if mi.is_spectral:
-        raise UnsupportedError(f"{_cannot(name)}: spectral variants keep coefficients of colours; write it under an "
-                               "rgb variant")  # fmt: skip
+    _require_colours(name)
     numbers = tuple(map(float, _flat(value)))
     if len(numbers) == 3:
         return Colour(numbers)
@@ -144,17 +149,14 @@ def _mesh(place: Node, shape: mi.Mesh, name: str, assets: Assets) -> None:
 
 def _picture(place: Node, name: str, value: Any, assets: Assets) -> None:
     """A texture: its values as they are, linear."""
-    if mi.is_spectral:
-        raise UnsupportedError(f"{_cannot(name)}: spectral variants keep coefficients of colours; write it under an "
-                               "rgb variant")  # fmt: skip
+    _require_colours(name)
     values = np.array(dr.detach(value))
     place.entries |= {FILE: assets.add(f"{name}.exr", files.picture(values)), "raw": True}
 
 
 def _environment(place: Node, name: str, value: Any, assets: Assets) -> None:
     """Mitsuba lets the last column stand once more before the first, and the first behind the last."""
-    if mi.is_spectral:
-        raise UnsupportedError(f"{_cannot(name)}: spectral variants keep coefficients of colours")
+    _require_colours(name)
     values = np.array(dr.detach(value))[:, 1:-1, :3]
     place.entries[FILE] = assets.add(f"{name}.exr", files.picture(values))
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from psdr_jit.core import files
-from psdr_jit.derivative.images import check_writable, srgb
+from psdr_jit.derivative.images import check_writable, colours, srgb
 from psdr_jit.errors import OptionError, SetupError
 from psdr_jit.inverse.observer import Care, Seen, curves, frame_due
 
@@ -51,7 +51,8 @@ class EventFiles:
         except OSError as error:
             raise files.refusal(self._folder, error) from error
         for view in problem.views:
-            self._care.attempt(lambda view=view: self._image(f"{view.name}/target", np.array(view.target), 0))
+            target = colours(np.array(view.target), view.aovs)
+            self._care.attempt(lambda view=view, target=target: self._image(f"{view.name}/target", target, 0))
 
     def step(self, seen: Seen) -> None:
         self._care.attempt(lambda: self._step(seen))
@@ -68,7 +69,8 @@ class EventFiles:
                 self._writer.add_scalar(tag, value, seen.iteration)
         if frame_due(seen.iteration, self._problem.settings.iterations):
             for k, image in seen.images.items():
-                self._image(f"{self._problem.views[k].name}/image", image, seen.iteration)
+                view = self._problem.views[k]
+                self._image(f"{view.name}/image", colours(image, view.aovs), seen.iteration)
 
     def _image(self, tag: str, image: np.ndarray, iteration: int) -> None:
         shown = np.round(255 * srgb(image)).astype(np.uint8)

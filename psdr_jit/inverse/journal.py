@@ -172,7 +172,8 @@ class Journal:
         rows = [(view.name, before, _look(problem, view), np.array(view.target))
                 for view, before in zip(problem.views[:SHOWN], self._initial, strict=True)]  # fmt: skip
         self._try(VIEWS, lambda: _write_views(self.folder / VIEWS, rows, problem.views[0].aovs))
-        self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", rows))
+        seen = [(name, *(images.colours(image, problem.views[0].aovs) for image in shown)) for name, *shown in rows]
+        self._try("result.png", lambda: pictures.write_strip(self.folder / "result.png", seen))
         self._try("curves.png", lambda: pictures.write_curves(self.folder / "curves.png", self._rows))
 
     def _scene(self, problem: Any) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from psdr_jit.derivative.images import check_writable, srgb
+from psdr_jit.derivative.images import check_writable, colours, srgb
 from psdr_jit.errors import OptionError, SetupError
 from psdr_jit.inverse import stage, viewer
 from psdr_jit.inverse.observer import Care, Seen, curves, frame_due
@@ -88,7 +88,7 @@ class LiveView:
         """What rests, and the targets."""
         rr, problem = self._rr, self._problem
         for view in problem.views:
-            self._image(["targets", view.name], np.array(view.target), static=True)
+            self._image(["targets", view.name], colours(np.array(view.target), view.aovs), static=True)
         for name, shape in stage.bodies(problem).items():
             if name not in self._moving:
                 self._shape(name, shape, static=True)
@@ -104,7 +104,8 @@ class LiveView:
         if frame_due(seen.iteration, self._problem.settings.iterations):
             self._move()
             for k, image in seen.images.items():
-                self._image(["world", "cameras", self._problem.views[k].name], image)
+                view = self._problem.views[k]
+                self._image(["world", "cameras", view.name], colours(image, view.aovs))
 
     def _end(self, iteration: int) -> None:
         self._log.set_time(TIMELINE, sequence=iteration)

@@ -107,7 +107,8 @@ def _layers(path: Path) -> dict[str, np.ndarray]:
     try:
         channels = images.read_exr(path)
     except (RuntimeError, OSError, ValueError, TypeError) as error:
-        raise OptionError(f"'{path}' cannot be read as an OpenEXR file: {error}") from error
+        raise OptionError(f"'{path}' cannot be read as an OpenEXR file ({error}): give one that psdr gradient has "
+                          "written, or the folder of psdr optimize") from error
     grouped: dict[str, dict[str, np.ndarray]] = {}
     for name, plane in channels.items():
         layer, _, channel = name.rpartition(".")

@@ -18,6 +18,8 @@ from psdr_jit.scene.curve_ends import pad_curves
 from psdr_jit.scene.guard import require_scene, require_variant
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
+UNUSED = re.compile(r"Found unused parameters: - \$([\w.-]+)=")  # how Mitsuba says that a file has no such <default>
+DEFAULT = re.compile(r'<default\s+name\s*=\s*"([^"]+)"')
 
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -58,6 +60,9 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
         scene = mi.load_file(os.fspath(path), optimize=False, **{k: str(v) for k, v in defaults.items()})
     except (RuntimeError, UnicodeDecodeError) as error:
         text = _cause(error)
+        if unused := UNUSED.findall(text):
+            raise SceneError(f"scene file '{path}' has no <default name=\"{unused[0]}\"> to set; {_defaults(path)}"
+                             ) from error  # fmt: skip
         by_mesh = not text or "shape plugin" in text or isinstance(error, UnicodeDecodeError)
         if by_mesh and meshes and not any(mesh in text for mesh in meshes):
             text += f" Is one of its mesh files empty or corrupt: {', '.join(meshes)}?"
@@ -69,6 +74,12 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
         raise SceneError(f"scene file '{path}' has no <sensor>: there is no image to render")
     pad_curves(scene)
     return scene
+
+
+def _defaults(path: Path) -> str:
+    """What the file lets one set."""
+    names = DEFAULT.findall(path.read_text(encoding="utf-8", errors="replace"))
+    return f"it has {', '.join(map(repr, names))}" if names else "it has none at all"
 
 
 def _cause(error: Exception) -> str:

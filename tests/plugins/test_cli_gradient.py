@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import numpy as np
 import pytest
@@ -188,3 +189,30 @@ def test_demo_cannot_make_its_folder(capsys):
     with open("file", "w"):
         pass
     assert "cannot make the folder" in refused(capsys, "demo", "--out", "file/sub")
+
+
+@pytest.mark.parametrize("inside, colours", [('<integrator type="path" name="image"/>', "RGB"), ("", "")])
+def test_channels_of_mitsubas_aov_have_their_names(tmp_path, inside, colours):
+    text = open(CARD, encoding="utf-8").read()
+    own = re.search(r"<integrator.*?</integrator>", text, re.DOTALL)[0]
+    aov = f'<integrator type="aov"><string name="aovs" value="dd:depth,nn:sh_normal"/>{inside}</integrator>'
+    scene = tmp_path / "aov.xml"
+    mesh = str(scene_io.shipped_scene("meshes/card.obj"))
+    scene.write_text(text.replace(own, aov).replace("meshes/card.obj", mesh), encoding="utf-8")
+    assert main(["render", str(scene), "-D", "res=8", "--spp", "1", "-o", "a.exr", "--quiet"]) == 0
+    channels = {name for name in images.read_exr("a.exr") if not name.startswith("primal.")}
+    assert channels == {*colours, "dd.T", "nn.X", "nn.Y", "nn.Z"}
+    assert main(["render", str(scene), "-D", "res=8", "--spp", "1", "-o", "a.png", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("more, words", [
+    (["-D", "size=3"], ("no <default name=\"size\">", "it has 'res'")),
+    (["--integrator", "psdr"], ("no integrator 'psdr'", "psdr_path and psdr_bdpt")),
+])  # fmt: skip
+def test_names_that_are_not_there_are_answered_with_those_that_are(capsys, more, words):
+    said = refused(capsys, "gradient", CARD, *MOVE, *more)
+    assert all(word in said for word in words) and "Plugin" not in said
+
+
+def test_reports_of_other_files_are_refused(capsys):
+    assert "psdr gradient has written, or the folder of psdr optimize" in refused(capsys, "report", CARD)

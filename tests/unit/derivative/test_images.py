@@ -48,6 +48,18 @@ def test_aovs_do_not_pass_for_alpha(tmp_path, noise, colours):
     assert np.array_equal(found["total.dd.T"], image[..., -2].astype(np.float32))
 
 
+@pytest.mark.parametrize("own", ["Y", "YA", "RGB", "RGBA"])
+def test_aovs_and_alpha_are_no_shade_of_grey(own):
+    """Depth is tens of times as large as radiance: averaged in, it would be all that there is to see."""
+    radiance, depth = np.full((2, 2, 1), 0.25), np.full((2, 2, 2), 40.0)
+    image = np.concatenate([radiance] * len(own.rstrip("A")) + [depth[..., :1]] * own.count("A") + [depth], axis=-1)
+    seen = images.colours(image, ["dd.T", "ss.I"])
+    assert seen.shape[-1] == len(own)
+    assert np.all(images.grey(seen) == 0.25)
+    assert np.ptp(images.srgb(seen), axis=-1).max() == 0
+    assert images.colours(depth, ["dd.T", "ss.I"]).shape == depth.shape, "there is nothing else to see"
+
+
 def test_layers_of_different_size_are_rejected(tmp_path, noise):
     with pytest.raises(OptionError, match="one size"):
         images.write_exr(tmp_path / "a.exr", {"primal": noise, "total": noise[:3]})

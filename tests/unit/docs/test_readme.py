@@ -18,6 +18,7 @@ ROOT = Path(psdr_jit.__file__).resolve().parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = (
     "README.md", "scenes/README.md", "scenes/inverse/README.md", "benchmarks/README.md", "benchmarks/results/README.md",
+    "psdr_jit/cluster/README.md",
 )  # fmt: skip
 SHIPPED = ("README.md", "cbox.xml", "inverse/README.md", "inverse/rotation.toml", "meshes/box.obj")
 LONGEST = 250  # lines that somebody reads who wants to know what this is

@@ -155,3 +155,25 @@ def test_another_source_and_the_source_itself(llvm, tmp_path):
         write_scene(scene, shadow, shadow)
     with pytest.raises(OptionError, match=r"ends in \.xml"):
         write_scene(scene, tmp_path / "now", shadow)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["floor.bsdf.reflectance.data", "sky.data", "paint.reflectance.value"])
+def test_spectral_variants_are_refused_with_the_way_out(llvm, tmp_path, name):
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="a.png"/></texture>'
+    mi.util.write_bitmap(str(tmp_path / "a.png"), np.full((4, 4, 3), 0.5, np.float32))
+    source = tmp_path / "s.xml"
+    source.write_text(
+        f'<scene version="3.0.0"><sensor type="perspective"/><bsdf type="diffuse" id="paint"/>'
+        f'<emitter type="envmap" id="sky"><string name="filename" value="a.png"/></emitter>'
+        f'<shape type="rectangle" id="floor"><bsdf type="diffuse">{texture}</bsdf></shape>'
+        f'<shape type="rectangle" id="wall"><ref id="paint"/></shape></scene>'
+    )
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        scene = scene_io.load_scene(source)
+        moved(scene, name)
+        with pytest.raises(UnsupportedError, match="keep coefficients of colours; write it under an rgb variant"):
+            write_scene(scene, tmp_path / "out.xml", source)
+    finally:
+        mi.set_variant("llvm_ad_rgb")
