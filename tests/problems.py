@@ -42,7 +42,6 @@ GAUSSIAN = {"rfilter": "gaussian"}
 RGBA = {"pixel_format": "rgba"}
 HIDDEN = {"hide_emitters": True}
 DEPTH_3 = {"max_depth": 3}
-SMOOTH = {"normals": "smooth"}
 
 PROBLEMS = (
     # light that moves or changes
@@ -145,7 +144,6 @@ PROBLEMS = (
     Problem("grid_shadow", "blocker.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, tag="indirect", slow=True),
     Problem("grid_shadow", "blocker.grid", 0.004, load=GAUSSIAN, slow=True),
     Problem("grid_shadow", "camera.to_world", 0.004, direction=X, load=DEPTH_3 | GAUSSIAN, slow=True),
-    Problem("grid_shadow", "camera.to_world", 0.004, direction=Y, load=SMOOTH | GAUSSIAN, tag="smooth", slow=True),
     Problem("grid_shadow", "light.to_world", 0.01, direction=X, slow=True),
     Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.bounce import particle_correction
+from ..paths.bounce import particle_eval
 from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
 from .chain_fixed import EVEN, Direction
 
@@ -53,9 +53,10 @@ def leave(
     smooth, share = smooth_choice(bsdf, k, u.x)
     smooth &= active
     onward = _delta_leave(si, ctx, (u.y, fixed.reflected), active & ~smooth)
-    f = bsdf.eval(ctx, si, si.to_local(fixed.ω), smooth)
     if ctx.mode == mi.TransportMode.Importance:
-        f *= particle_correction(si, fixed.ω)
+        f = particle_eval(si, bsdf, fixed.ω, smooth)
+    else:
+        f = bsdf.eval(ctx, si, si.to_local(fixed.ω), smooth)
     ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
     factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
     return Leaving(ray, factor, (smooth & dr.any(factor != 0)) | onward.alive, onward.alive)

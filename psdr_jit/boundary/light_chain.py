@@ -39,7 +39,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.sensor_frame import lens_point
 from ..core.streams import Stream, stream_seed
-from ..paths.bounce import particle_correction
+from ..paths.bounce import particle_eval
 from ..paths.light_walk import take_up
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
@@ -139,8 +139,7 @@ def _connected(job: Job, pair: Pair, chain: ChainRecords, Φ: mi.Spectrum, wavel
     ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
     si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
     view, aperture = sensor_view(job.frame, si.p, pair.light.u)
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    f = si.bsdf().eval(ctx, si, si.to_local(-view.ω), pair.in_light) * particle_correction(si, -view.ω)
+    f = particle_eval(si, si.bsdf(), -view.ω, pair.in_light)
     return view, aperture, dr.select(pair.in_light, Φ * pair.β_a * f / view.J_px, 0)
 
 

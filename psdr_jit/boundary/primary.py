@@ -29,7 +29,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
-from ..edges.kind import EdgeKind, Sight
+from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
 from ..edges.scene_table import scene_edges
@@ -95,30 +95,24 @@ class Steps:
     valid: mi.Bool
 
 
-def film_weights(job: Job, shades_only: bool = True) -> list[mi.Float]:
-    """By kind of edge, the weight of each row: of moving shapes, or of all if the camera moves.
-
-    Without `shades_only`, 0 for kinds at which no more than the shade of one surface steps.
-    """
+def film_weights(job: Job) -> list[mi.Float]:
+    """By kind of edge, the weight of each row: of moving shapes, or of all if the camera moves."""
     table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
-
-    def weight(kind: EdgeKind) -> mi.Float:
-        left_out = kind.shades_only and not shades_only
-        return dr.zeros(mi.Float, kind.count) if left_out else kind.film_weights(job.frame, border)
-
-    weights = table.weights(weight)
+    weights = table.weights(lambda kind: kind.film_weights(job.frame, border))
     if job.facts.camera_moves or not job.plan.prunes:
         return weights
     return [dr.select(moves, w, 0) for w, moves in zip(weights, table.moving(), strict=True)]
 
 
-def primary_edges(job: Job, shades_only: bool = True) -> PrimaryEdges | None:
-    """Edges that can move on the film, `shades_only` as of `film_weights`. None: nothing can."""
-    rows, table = job.call.memory[ROW_SAMPLER], scene_edges(job)
-    differs = not shades_only and any(kind.shades_only for kind in table.kinds)
-    state = row_state(job, f"{NAME}/surfaces" if differs else NAME, lambda: film_weights(job, shades_only))
-    return None if state is None else PrimaryEdges(table, rows, state)
+def primary_edges(job: Job) -> PrimaryEdges | None:
+    """Edges that can move on the film. None: nothing can."""
+    return edges_of_rows(job, row_state(job, NAME, lambda: film_weights(job)))
+
+
+def edges_of_rows(job: Job, state: Any | None) -> PrimaryEdges | None:
+    """Edges whose rows are drawn as `state` says."""
+    return None if state is None else PrimaryEdges(scene_edges(job), job.call.memory[ROW_SAMPLER], state)
 
 
 def seen_edge(job: Job, edges: PrimaryEdges, sample: EdgeSample) -> SeenEdge:

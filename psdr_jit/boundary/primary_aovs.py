@@ -13,11 +13,25 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
+from ..edges.scene_table import scene_edges
 from ..edges.table import look_beside
 from ..paths.aovs import Aovs
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
+from ..sampling.rows import row_state
 from . import primary
+
+
+def _edges(job: Job) -> primary.PrimaryEdges | None:
+    """`primary_edges` without those at which no more than the shade of one surface steps."""
+    kinds = scene_edges(job).kinds
+    if not any(kind.shades_only for kind in kinds):
+        return primary.primary_edges(job)
+    state = row_state(job, f"{primary.NAME}/surfaces", lambda: [
+        dr.zeros(mi.Float, kind.count) if kind.shades_only else weights
+        for kind, weights in zip(kinds, primary.film_weights(job), strict=True)
+    ])  # fmt: skip
+    return primary.edges_of_rows(job, state)
 
 
 def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.EdgeSample) -> list[mi.Float]:
@@ -36,7 +50,7 @@ def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.Ed
 
 def _steps(job: Job, aovs: Aovs) -> tuple[primary.PrimaryEdges, primary.Steps, list[mi.Float]] | None:
     """Samples, and their contributions per unit of motion by channel; None if there are none."""
-    edges = primary.primary_edges(job, shades_only=False)
+    edges = _edges(job)
     sample = None if edges is None else primary.sample_visible(job, edges)
     if sample is None:
         return None

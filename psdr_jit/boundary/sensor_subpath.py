@@ -30,7 +30,7 @@ from ..core.sensor_frame import View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..edges.points import facing
-from ..paths.bounce import PathLimits, PathState, bounce, particle_correction
+from ..paths.bounce import PathLimits, PathState, bounce, particle_eval
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.sensor_connection import on_film, seen_by_sensor
 from ..paths.tube_surface import surface_at
@@ -183,7 +183,8 @@ def _connected(records: SubpathRecords) -> mi.Bool:
 def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> SubpathRecords:
     """Walk every receiver x_D back to the sensor, at most `longest` vertices."""
     records = SubpathRecords(dr.width(receivers.lane), longest, job.facts.has_delta_lobes)
-    limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE)
+    own_frames = job.limits.own_frames
+    limits = PathLimits(longest, job.options.rr_depth, uniform_share=UNIFORM_SHARE, own_frames=own_frames)
     walk_to_sensor(job, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
     dr.eval(records.data)
     if records.delta is not None:
@@ -214,8 +215,7 @@ def _connect(job: Job, sampler, si, bsdf: mi.BSDFPtr, value: mi.Spectrum, active
     to_sensor = -view.ω
     seen = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (facing(si.n, view.ω) != 0)
     seen &= on_film(frame, view)
-    f = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, si.to_local(to_sensor), seen)
-    W = value * f * particle_correction(si, to_sensor) / view.J_px
+    W = value * particle_eval(si, bsdf, to_sensor, seen) / view.J_px
     seen = seen_by_sensor(job.scene, si, view, job.options.hide_emitters, seen & dr.any(W != 0))
     return _AtSensor(view, aperture, dr.select(seen, W, 0))
 

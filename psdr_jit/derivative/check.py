@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from numbers import Real
 from typing import Any
@@ -23,6 +23,7 @@ from psdr_jit.cluster.source import SceneFile
 from psdr_jit.core.progress import Report, reporting
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import integrator_specs, show
+from psdr_jit.derivative.effort import most_useful
 from psdr_jit.derivative.finite_differences import CentralDifference, default_block
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.remote import RemoteDifference, RemoteSampler
@@ -227,12 +228,23 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
             finer = difference(param, spec, sensor, reference_spp, reference.eps / 4)
             retry, block = _collect(estimate, finer, block, start, start + max_seconds, report, rule)
             if retry.verdict == INCONCLUSIVE:
+                verdict = verdict if _confirms(retry, finer.seeds, tolerance) else _in_doubt(verdict)
                 break
             verdict, reference = retry, finer
     return CheckResult(verdict, estimate.seeds, 2 * reference.seeds, spp, reference.spp, reference.eps, block,
                        time.perf_counter() - start, tuple(terms) or ("all of the given integrator",),
                        param.name, param.label, estimate.images.mean(), reference.result(block).mean,
                        tuple(Aovs.parse(spec.get("aovs", "")).channels))
+
+
+def _confirms(retry: Verdict, seeds: int, tolerance: float) -> bool:
+    """Does a smaller step, for which there was too little time, at least point the same way as a failure?"""
+    off = retry.max_z > MAX_Z or abs(retry.gain - 1) > tolerance + 2 * retry.gain_stderr
+    return seeds >= MIN_SEEDS // 2 and off
+
+
+def _in_doubt(verdict: Verdict) -> Verdict:
+    return replace(verdict, verdict=INCONCLUSIVE, reason=f"{verdict.reason}; no time to see if a smaller step cures it")
 
 
 def _noted(limit: float, report: Report) -> Callable[[float, Verdict], None]:
@@ -280,21 +292,9 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
             progress(now - start, verdict)
         if verdict.verdict != INCONCLUSIVE or now >= deadline:
             return verdict, block
-        sampler = _most_useful(estimate, reference)
+        sampler = most_useful(estimate, reference)
         if verdict.reason.startswith(SCATTER) and min(estimate.seeds, reference.seeds) < SETTLED_SEEDS:
             sampler = estimate if estimate.seeds < reference.seeds else reference
         rate = sampler.seconds / sampler.seeds
         # growing batches keep the share of bookkeeping constant, short enough not to miss the deadline
         sampler.add(int(np.clip(min(sampler.seeds // 3, (deadline - now) / rate), sampler.at_once, 256)))
-
-
-def _most_useful(estimate: DerivativeSampler, reference: CentralDifference) -> Any:
-    """The sampler that lowers the variance of the gain most per second."""
-    f1, f2 = reference.halves
-    slope = gain(estimate.images.group_means(), f1.group_means(), f2.group_means())
-    if not slope.has_signal:
-        return reference if reference.seconds <= estimate.seconds else estimate
-    # adding one second's worth of seeds lowers a variance V after t seconds by about V / t
-    by_estimate = slope.stderr_estimate**2 / estimate.seconds
-    by_reference = slope.stderr_reference**2 / reference.seconds
-    return estimate if by_estimate > by_reference else reference

@@ -53,6 +53,8 @@ def _place(job: Job, index: int, facts: EmitterFacts) -> tuple:
     if facts.shape >= 0:
         owner = job.facts.shapes[facts.shape].index
         box = edge_shapes(job).shapes[owner].bbox() if owner >= 0 else job.scene.bbox()
+    elif not box.valid():  # of a projector
+        box = job.scene.bbox()
     return box.min, box.max
 
 

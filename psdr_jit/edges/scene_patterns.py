@@ -21,7 +21,14 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.curve_ends import SEGMENTS
 from ..scene.facts import ShapeFacts
-from ..scene.patterns import StepFamily, pattern_textures, step_families, steps_between_faces, texture_values
+from ..scene.patterns import (
+    StepFamily,
+    pattern_textures,
+    pattern_textures_on_curve,
+    step_families,
+    steps_between_faces,
+    texture_values,
+)
 from .curve_pattern_rows import curve_patterns
 from .edge_shapes import edge_shapes
 from .kind import EdgeKind
@@ -131,7 +138,7 @@ def _shape_patterns(job: Job, facts: ShapeFacts) -> _Known:
     if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
         return known
     is_curve = facts.kind == "curve"
-    textures = pattern_textures(shape, is_curve)
+    textures = pattern_textures_on_curve(shape) if is_curve else pattern_textures(shape)
     values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]
     buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
     buffers += [mi.traverse(shape)[SEGMENTS]] if is_curve else []

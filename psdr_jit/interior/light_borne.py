@@ -34,7 +34,7 @@ from ..core.sensor_frame import look_at
 from ..core.varying import varying
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedError, UnsupportedWarning
-from ..paths.bounce import PathLimits, particle_correction
+from ..paths.bounce import PathLimits, particle_eval
 from ..paths.delta_step import delta_step
 from ..paths.light_source import LightStart
 from ..paths.light_walk import LightPath
@@ -174,7 +174,7 @@ def _terms(found: LightBorne, k: mi.UInt32, ray: mi.Ray3f, moves: Displacements,
     view = look_at(job.frame, x, path.aperture)
     seen = view.ω + moves.of_view(path.film, path.aperture, dr.detach(view.ω))
     wo = dr.select(last, -seen, onward.d)
-    w = bsdf.eval(ctx, si, si.to_local(wo), active & ~delta) * particle_correction(si, wo)
+    w = particle_eval(si, bsdf, wo, active & ~delta)
     w = dr.select(last, w / view.J_px, w)
     step = delta_step(ctx, si, bsdf, onward.d, active & delta)
     d = dr.select(delta, step.d, onward.d)

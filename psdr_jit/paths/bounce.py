@@ -88,7 +88,12 @@ def bounce(
     u_lobe, u = sampler.next_1d(), sampler.next_2d()
     s = sample_scattering(ctx, si, bsdf, u_lobe, u, limits.mixture, limits.refuses, active)
     if ctx.mode == mi.TransportMode.Importance:
-        s.weight = s.weight * particle_correction(si, si.to_world(s.wo))
+        onward = si.to_world(s.wo)
+        weight = s.weight * particle_correction(si, onward)
+        if limits.own_frames:  # a frame that `si` does not know bends the cosine
+            f = particle_eval(si, bsdf, onward, active & ~s.delta & (s.pdf > 0))
+            weight = dr.select(s.delta, weight, f * dr.select(s.pdf > 0, dr.rcp(s.pdf), 0))
+        s.weight = weight
     return _after_roulette(s, sampler, path, limits, active)
 
 
@@ -124,6 +129,21 @@ def _after_roulette(s: Scattering, sampler, path: PathState, limits: PathLimits,
         survives &= β_max != 0
     following = PathState(path.k + 1, β * dr.select(survives, dr.rcp(survival), 0), η)
     return Bounce(s, survival, active & survives & (s.pdf > 0), following)
+
+
+def particle_eval(
+    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, onward: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
+    """f cosθ of particles that leave in the direction `onward`, world space: what light from there to here meets.
+
+    It is `path`'s own BSDF, with both directions exchanged: a bump map bends the frame in which the cosine of the
+    *light* is taken, of which `si` knows nothing.
+    """
+    seen = mi.SurfaceInteraction3f(si)
+    seen.wi = si.to_local(onward)
+    f = bsdf.eval(mi.BSDFContext(), seen, si.wi, active)
+    arriving = dr.dot(si.n, si.to_world(si.wi))
+    return f * dr.select(arriving != 0, dr.abs(dr.dot(si.n, onward) / arriving), 0)
 
 
 def particle_correction(si: mi.SurfaceInteraction3f, onward: mi.Vector3f) -> mi.Float:

@@ -158,6 +158,13 @@ def light_bounds(job: Job) -> list[LightBounds] | None:
         owner = job.facts.shapes[facts.shape] if facts.shape >= 0 else None
         shape = None if owner is None else job.scene.shapes()[owner.index]
         box = emitter.bbox() if shape is None else shape.bbox()
+        if not box.valid():  # a projector says that it is nowhere
+            if not mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition):
+                return None
+            start = dr.detach(emitter.world_transform() @ mi.Point3f(0))
+            there = [mi.Vector4f(start.x, start.y, start.z, 1)]
+            found.append(LightBounds(there, there))
+            continue
         corners = [varying(mi.Vector4f, [*box.corner(i), 1.0]) for i in range(8)]
         flat = owner is not None and owner.plugin in ("rectangle", "disk")
         found.append(LightBounds(corners, [corners[0], corners[7]], _plane_of(shape) if flat else None))

@@ -35,7 +35,7 @@ from .graph import (
 )
 from .guard import require_derivatives
 from .instances import require_codes, shape_groups
-from .patterns import missing_patterns
+from .patterns import missing_on_curves, missing_patterns
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,8 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         kind = "curve"
     else:  # a shape plugin of somebody else is fine as long as it is made of triangles
         kind = "mesh" if is_mesh else "unsupported"
-    missing, jumps = (missing_patterns(found, on_curve=kind == "curve") for found in (steps, jumps))
+    missing_of = missing_on_curves if kind == "curve" else missing_patterns
+    missing, jumps = missing_of(steps), missing_of(jumps)
     return ShapeFacts(
         name=graph.name(shape, index),
         index=index,

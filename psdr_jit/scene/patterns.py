@@ -40,13 +40,18 @@ class StepFamily:
         return k[self.steps[k.astype(np.int64) % len(self.steps)]]
 
 
-def missing_patterns(jumps: tuple[str, ...], on_curve: bool = False) -> tuple[str, ...]:
+def missing_patterns(jumps: tuple[str, ...]) -> tuple[str, ...]:
     """Those of `graph.jumping_textures` whose steps are no edges."""
-    return tuple(jump for jump in jumps if jump.split(" ")[0] not in _plugins(on_curve))
+    return _not_of(PATTERN_PLUGINS, jumps)
 
 
-def _plugins(on_curve: bool) -> frozenset[str]:
-    return PATTERNS_ON_CURVES if on_curve else PATTERN_PLUGINS
+def missing_on_curves(jumps: tuple[str, ...]) -> tuple[str, ...]:
+    """Those of `graph.jumping_textures` whose steps are no edges where they lie on a curve."""
+    return _not_of(PATTERNS_ON_CURVES, jumps)
+
+
+def _not_of(plugins: frozenset[str], jumps: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(jump for jump in jumps if jump.split(" ")[0] not in plugins)
 
 
 def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str, ...]) -> tuple[str, ...]:
@@ -61,10 +66,14 @@ def steps_of_light(emitter: mi.Emitter, plugin: str, rim: str, jumps: tuple[str,
     return (*own, *(jump for jump in jumps if jump not in missing))
 
 
-def pattern_textures(shape: mi.Shape, on_curve: bool = False) -> list[mi.Object]:
+def pattern_textures(shape: mi.Shape) -> list[mi.Object]:
     """The textures and bump maps that step inside of `shape`, on its BSDF and on its emitter, each once."""
-    found = stepping_textures([shape.bsdf(), shape.emitter()])
-    return [node for node in found if plugin_name(node) in _plugins(on_curve)]
+    return stepping_textures([shape.bsdf(), shape.emitter()])
+
+
+def pattern_textures_on_curve(curve: mi.Shape) -> list[mi.Object]:
+    """The same of a curve: those whose steps on it are edges."""
+    return [node for node in pattern_textures(curve) if plugin_name(node) in PATTERNS_ON_CURVES]
 
 
 def stepping_textures(owners: list[mi.Object | None]) -> list[mi.Object]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -158,3 +160,34 @@ def test_a_change_that_no_sample_met_has_an_error(card):
     unseen = still & (block_means(difference.result(BLOCK).mean, BLOCK) == 0)
     assert unseen.sum() > 100 and np.all(floor[unseen] > 0.5 * one_sample)
     assert np.all(floor[0] == 0), "black far from the card: anything there would be an error"
+
+
+def beside_a_border_of_pixels() -> mi.Scene:
+    """A card whose outline a step of finite differences takes across the border of a pixel, a quarter of it not."""
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
+    place = mi.ScalarTransform4f().translate([0.024 * 2 / 8, 0, 0]).scale(0.5)
+    return mi.load_dict({
+        "type": "scene",
+        "camera": {"type": "orthographic", "film": film, "to_world": pose},
+        "card": {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}},
+    })  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hurry", [False, True])
+def test_a_failure_is_not_believed_before_a_smaller_step_was_tried(hurry):
+    """Where there is time for it, it passes; where there is none, nobody knows."""
+    scene_io.use_variant("llvm_ad_rgb")
+    said = []
+
+    def linger(seconds, v):
+        said.append(v.verdict)
+        if hurry and v.verdict == FAIL:
+            time.sleep(max(limit - seconds, 0))
+
+    limit = 90.0
+    result = check_gradient(beside_a_border_of_pixels(), "card.to_world", (1, 0, 0), integrator="psdr_path",
+                            spp=16, reference_spp=2048, max_seconds=limit, progress=linger)  # fmt: skip
+    assert FAIL in said
+    assert result.verdict.verdict == (INCONCLUSIVE if hurry else PASS), str(result)

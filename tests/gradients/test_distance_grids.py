@@ -166,6 +166,21 @@ def test_a_camera_passes(llvm, name):
     assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
 
 
+@pytest.mark.slow
+def test_a_fine_grid_with_blended_normals(llvm):
+    """The coarse grid of the file has gain 0.98, and is named."""
+    scene = scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=24, normals="smooth", rfilter="gaussian")
+    params = mi.traverse(scene)
+    params["blocker.grid"] = mi.TensorXf(torus(48)[..., None].astype(np.float32))
+    params.update()
+    motion = perturb(scene, "camera.to_world", direction=(0, 1, 0))
+    spec = {"type": "psdr_path", "max_depth": 2, "rr_depth": 1000}
+    reference = fd(motion, spec, 0.004, 16, 2048)
+    slope = gain(forward(motion, spec, 16, 256), reference[0::2], reference[1::2])
+    assert slope.stderr < 0.01, slope
+    assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
+
+
 @pytest.mark.parametrize("normals", [pytest.param("smooth", marks=pytest.mark.slow), "analytic"])
 def test_coarse_grids_with_blended_normals_are_named(llvm, normals):
     scene = scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=8, normals=normals)

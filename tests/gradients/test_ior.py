@@ -173,10 +173,11 @@ def test_a_picture_behind_a_ball(llvm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", ["ball", "cube", "slab", "smooth_ball"])
-def test_a_picture_behind_glass(llvm, shape):
+@pytest.mark.parametrize(("shape", "seeds"), [("ball", 16), ("cube", 16), ("slab", 16), ("smooth_ball", 64)])
+def test_a_picture_behind_glass(llvm, shape, seeds):
+    """Few crossings of lines with the outline of the card, seen at the rim of a ball of facets, move very fast."""
     motion = perturb(behind_glass(with_ior(shape)), "glass.bsdf.eta")
-    assert_gain(motion, spec(8, **BEHIND), (16, 1024), (STEP, 32, 16384))
+    assert_gain(motion, spec(8, **BEHIND), (seeds, 1024), (STEP, 32, 16384))
 
 
 @pytest.mark.slow

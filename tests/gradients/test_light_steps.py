@@ -149,6 +149,33 @@ def test_a_stretched_picture_on_a_ball(llvm):
     assert_gain(scene_of(light, ball=ball), "ball.to_world", {"direction": (0.4, 0.3, 0.5)})
 
 
+def box() -> dict:
+    """Closed, in the beam: which of its edges are outlines depends on where the light is."""
+    place = mi.ScalarTransform4f().translate([0.1, 0, 0.5]).rotate([0.2, 1, 0.1], 30).scale(0.25)
+    return {"type": "cube", "to_world": place}
+
+
+def test_a_projector_sees_the_outlines_that_a_lamp_in_its_place_sees(llvm):
+    """Mitsuba's projectors have no bounding box."""
+    place = [float(x) for x in pose().translation()]
+    lights = {"its frame": projector(), "": {"type": "point", "position": place}}
+    sampled = {}
+    for step, light in lights.items():
+        plan = psdr_jit.make_plan(scene_of(light, box=box()), ["box.vertex_positions"], integrator={
+            "type": "psdr_path", "max_depth": 2, "form": "spatial", "sppc": 1, "sppp": 1, "sppd": 1,
+        })  # fmt: skip
+        sampled[step] = plan.term("direct").edges
+    with_frame, without = sampled["its frame"], sampled[""]
+    assert with_frame.sampled - without.sampled == with_frame.total - without.total > 0
+    assert 0 < without.sampled < without.total
+
+
+@slow
+@pytest.mark.parametrize("param, how", [("light.to_world", MOVED), ("box.vertex_positions", {"direction": (1, 0, 0)})])
+def test_the_shadow_of_a_box(llvm, param, how):
+    assert_gain(scene_of(projector(picture()), box=box()), param, how)
+
+
 @slow
 def test_two_lights(llvm):
     other = spot(intensity=8.0, to_world=pose((-1, 0.5, 2), (0, 0, 0)))
