@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from ..core.ad import tangents
 from ..core.records import Hit
+from ..core.sensor_frame import film_area
 from ..paths.tube_surface import surface_at
 from ..scene.tubes import Tubes
 
@@ -58,6 +59,10 @@ class Displacements(ABC):
     @abstractmethod
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The same material point with all that is known of it; `ray` is that of `hit`."""
+
+    @abstractmethod
+    def film_area(self, kind: str) -> mi.Float:
+        """Area that a pixel of the sensor of this kind sees at distance 1, relative to what it is: of value 1."""
 
     @abstractmethod
     def of_lights(self) -> mi.Vector3f:
@@ -138,6 +143,10 @@ class SceneDisplacements(Displacements):
 
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         return surface_at(self.tubes, hit.intersection(), ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+
+    def film_area(self, kind: str) -> mi.Float:
+        area = film_area(self.sensor, kind)
+        return area / dr.detach(area)
 
     def of_lights(self) -> mi.Vector3f:
         return mi.Vector3f(0)
