@@ -20,8 +20,8 @@ they share y_1, hence the flow. At the first they do not: each side then has the
 For the surface that ends in the edge itself, F_θ = 0: its material does not pass its own border. What is left is the
 other side, light that something comes in between of, or no longer does.
 
-Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts or touches what
-it shines on, rays that leave it beside the cut start beyond that: the step there is missed.
+Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts into what it
+shines on, both sides are looked at a little off the cut (`chain_outline.beside_cut`).
 """
 
 from __future__ import annotations
