@@ -13,8 +13,8 @@ relative derivatives, and that of |dA_1|. How light crowds on a receiver is not 
 make it, and no Jacobian of the chain is needed. The price is that h is smooth; a box filter has no ∇h.
 
 As y_1 stays, the outline of a body as the light sees it is no discontinuity: E cosθ_1 goes to 0 there, and a sheet
-keeps its edge. The camera moves as if everything else moved the other way; J has the area of a pixel at distance 1 as a
-factor, which changes with the field of view.
+keeps its edge. The camera moves as if everything else moved the other way; what else changes J, such as the field of
+view, is a factor of its own (`footprint`).
 
 Not in here: that something else comes between the light and y_1, that a later vertex goes past an edge, and that y_s
 goes behind something that hides it from the camera: `boundary/light_chain.py`.
@@ -147,7 +147,7 @@ def _leave(found: LightBorne, moves: Displacements) -> tuple[mi.Point3f, mi.Vect
     lit, d, measure = material_segment(o, hit, found.wavelengths, moves, active)
     projected = measure * dr.relative_grad(dr.squared_norm(lit.p - o))  # cosθ_1 |dA_1|
     if found.job.facts.camera_moves:
-        projected /= moves.film_area(found.job.frame.kind)
+        projected /= moves.footprint(found.job.frame.kind, found.path.film, found.path.aperture)
     lit.p = lit.p - moves.of_lights()
     _, E = emitter.sample_direction(lit, mi.Point2f(0.5), active)
     return o, d, _relative(E) * projected

@@ -113,7 +113,7 @@ class ProbeDisplacements(Displacements):
         si.n, si.sh_frame = _turned(si, self._turn_of(hit.shape))
         return si
 
-    def film_area(self, kind: str) -> mi.Float:
+    def footprint(self, kind: str, film: mi.Point2f, aperture: mi.Point2f) -> mi.Float:
         return mi.Float(1)  # as of every rigid motion
 
     def of_lights(self) -> mi.Vector3f:
