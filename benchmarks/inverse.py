@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks import rows
 from benchmarks.distances import chamfer
 from benchmarks.inverse_pictures import write_section
-from benchmarks.inverse_tables import OURS, OVERHEAD, PEER
+from benchmarks.inverse_tables import CAMERA_PATHS, OURS, OVERHEAD, PEER
 from benchmarks.suites import Settings
 from psdr_jit.errors import PsdrError
 from psdr_jit.inverse import config, loop
@@ -142,7 +142,9 @@ def quick_case_names() -> list[str]:
 
 
 def method_names(case: str) -> list[str]:
-    return [OURS] if case.startswith(OVERHEAD) else [OURS, PEER]
+    if case.startswith(OVERHEAD):
+        return [OURS]
+    return [OURS, PEER, CAMERA_PATHS] if case.startswith("caustic") else [OURS, PEER]
 
 
 def open_case(name: str, settings: Settings) -> Opened:
@@ -165,7 +167,7 @@ def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     if opened.name.startswith(OVERHEAD):
         return {**row, **iteration_times(opened)}
     try:
-        chosen = opened.config if method_name == OURS else peer_of(opened)
+        chosen = opened.config if method_name == OURS else peer_of(opened, method_name)
         found, folder = run(opened, chosen)
     except (PsdrError, RuntimeError, TypeError) as error:
         return {**row, "settings": {}, "status": "cannot", "error": f"{type(error).__name__}: {str(error)[:200]}"}
@@ -175,15 +177,16 @@ def measure(opened: Opened, method_name: str) -> dict[str, Any]:
     return {**row, **found}
 
 
-def peer_of(opened: Opened) -> config.Config:
-    """The peer with as many iterations as fit into our time."""
+def peer_of(opened: Opened, method_name: str) -> config.Config:
+    """Another integrator with as many iterations as fit into our time."""
     stored = rows.read([opened.settings.folder / f"{NAME}.jsonl"])
     ours = [r for r in stored if r["case"] == opened.name and r["method"] == OURS and r["status"] == "ok"]
     if not ours:
-        raise PsdrError(f"there is no row of {OURS} whose time could be given to {PEER}")
+        raise PsdrError(f"there is no row of {OURS} whose time could be given to {method_name}")
     seconds = ours[-1]["seconds"]
-    chosen = config.with_integrator(opened.config, PEER)
-    chosen = replace(chosen, integrator={**chosen.integrator, "guiding": "none"})
+    chosen = config.with_integrator(opened.config, "psdr_path" if method_name == CAMERA_PATHS else PEER)
+    if method_name == PEER:
+        chosen = replace(chosen, integrator={**chosen.integrator, "guiding": "none"})
     problem = config.problem_of(replace(chosen, settings=replace(chosen.settings, iterations=TRIAL, max_seconds=None)))
     times: list[float] = [time.perf_counter()]
     loop.run(problem, progress=lambda *_: times.append(time.perf_counter()))

@@ -7,11 +7,12 @@ from typing import Any
 from benchmarks.tables import markdown
 
 OURS, PEER = "psdr_path", "prb_projective"
+CAMERA_PATHS = "psdr_path without light subpaths"  # where the example has psdr_bdpt, in equal time
 OVERHEAD = "overhead: "  # begins the names of cases that take the time of an iteration apart
 
 UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer": "Chamfer distance",
          "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size",
-         "ior": "refractive index", "left": "left lamp: relative brightness",
+         "ior": "refractive index", "spot": "spot: distance / size", "left": "left lamp: relative brightness",
          "right": "right lamp: relative brightness"}  # fmt: skip
 
 
@@ -21,7 +22,7 @@ def outcome_table(found: list[dict[str, Any]]) -> str:
     runs = [r for r in found if not r["case"].startswith(OVERHEAD)]
     for case in dict.fromkeys(r["case"] for r in sorted(runs, key=lambda r: r["family"])):
         of = {r["method"]: r for r in found if r["case"] == case}
-        ours, peer = of.get(OURS), of.get(PEER)
+        ours, peer, alone = (of.get(method) for method in (OURS, PEER, CAMERA_PATHS))
         if ours is None or ours["status"] != "ok":
             lines.append([case, "", "", f"cannot: {ours['error']}" if ours else "", "", "", ""])
             continue
@@ -35,8 +36,20 @@ def outcome_table(found: list[dict[str, Any]]) -> str:
                 f"{ours['seconds']:.0f} s, {ours['iterations']}" if k == 0 else "",
                 theirs, f"{peer['seconds']:.0f} s, {peer['iterations']}" if there and k == 0 else "",
             ])  # fmt: skip
+        if alone is not None and alone["status"] == "ok":
+            lines += _alone(case, alone)
     head = ("example", "error", "start", "solved below", OURS, "time, iterations", PEER, "time, iterations")
     return markdown(head, lines)
+
+
+def _alone(case: str, row: dict[str, Any]) -> list[list[str]]:
+    """Lines of an example of `psdr_bdpt` as `psdr_path` solves it."""
+    return [
+        [f"{case}, without light subpaths" if k == 0 else "", UNITS[name], f"{row['before'][name]:.3g}",
+         f"{limit:.3g}", f"{row['after'][name]:.3g}", f"{row['seconds']:.0f} s, {row['iterations']}" if k == 0 else "",
+         "", ""]
+        for k, (name, limit) in enumerate(row["limits"].items())
+    ]  # fmt: skip
 
 
 def overhead_table(found: list[dict[str, Any]]) -> str:

@@ -24,6 +24,7 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
+from ..edges.points import LEAST_SLANT, clear_of_lift
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..plan.probe_motion import registry_table
@@ -57,7 +58,8 @@ class Curve:
     shading: mi.Bool  # F = n·d
     pattern: mi.Bool  # F = g·(u, v), up to a constant
     g: mi.Vector2f
-    side: mi.Float  # sign of F on the first chain's side of a pattern's line
+    cut: mi.Bool  # it is the curve along which two surfaces cut
+    side: mi.Float  # sign of F on the first chain's side of a pattern's line, or of a cut
     m1: Hit
     m2: Hit
     c1: mi.Vector3f
@@ -189,16 +191,19 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
     h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
     shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)
     F = dr.select(shading, dr.select(first, h_near, h_far), dr.select(cut, F_cut, best.gap))
-    pattern, g, side = mi.Bool(False), mi.Vector2f(0), mi.Float(0)
+    n = mi.Vector3f(c1 + c2) * scale
+    in_front = dr.dot(si_near.n, n) / dr.dot(si_near.n, line.d) > dr.dot(si_far.n, n) / dr.dot(si_far.n, line.d)
+    pattern, g, side = mi.Bool(False), mi.Vector2f(0), dr.select(first ^ in_front, mi.Float(-1), 1)
     if patterns is not None:
         pattern = pair.family != NO_FAMILY
-        g, F_line, side = patterns.line(pair.family, _interaction(pair.a), _interaction(pair.b))
-        F, shading = dr.select(pattern, F_line, F), shading & ~pattern
+        g, F_line, side_line = patterns.line(pair.family, _interaction(pair.a), _interaction(pair.b))
+        F, shading, side = dr.select(pattern, F_line, F), shading & ~pattern, dr.select(pattern, side_line, side)
     return Curve(
         line=pair.a,
         shading=shading,
         pattern=pattern,
         g=g,
+        cut=cut & ~pattern & ~shading,
         side=side,
         m1=dr.select(cut, _resting(near, si_near.p, near.prim_uv), best.m),
         m2=dr.select(cut, _resting(far, si_far.p, far.prim_uv), best.m),
@@ -218,10 +223,31 @@ def beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
     step = si.dp_du * across.x + si.dp_dv * across.y
     crossed = curve.pattern & dr.all(dr.isfinite(step))
 
-    def moved(hit: Hit, side: mi.Float) -> Hit:
+    return _moved(scene, pair, curve.side * step, crossed)
+
+
+def beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+    """Where surfaces cut: both last segments moved off the curve, in parallel, until rounding no longer decides.
+
+    Rays that leave a surface start off it, and a point beside a cut is known to a few units in the last place: closer
+    to the curve, what is behind the other surface may be taken for what is in front. A segment whose own surface is the
+    one in front on the positive side, the larger n_i·n/(n_i·d), is moved along n = c_1 + c_2.
+    """
+    n = mi.Vector3f(curve.c1 + curve.c2)
+    crossed = curve.cut & ~pair.in_light & dr.isfinite(curve.side)
+    n_a, n_b = (_interaction(hit).n for hit in (pair.a, pair.b))
+    cot = dr.abs(dr.dot(n_a, n_b)) / dr.maximum(dr.norm(dr.cross(n_a, n_b)), LEAST_SLANT)
+    x = curve.line.o + curve.t * curve.line.d
+    return _moved(scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
+
+
+def _moved(scene: mi.Scene, pair: Pair, step: mi.Vector3f, crossed: mi.Bool) -> Pair:
+    """The last segments shifted by ±`step`, where they still end on the same shapes."""
+
+    def moved(hit: Hit, step: mi.Vector3f) -> Hit:
         # From half of the way: beside its start there may be the surface that it has left.
-        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + side * step, hit.d)
+        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + step, hit.d)
         there = Hit.of(ray, scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
         return dr.select(crossed & (there.shape == hit.shape), there, hit)
 
-    return replace(pair, a=moved(pair.a, curve.side), b=moved(pair.b, -curve.side))
+    return replace(pair, a=moved(pair.a, step), b=moved(pair.b, -step))

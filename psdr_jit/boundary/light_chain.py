@@ -20,8 +20,8 @@ they share y_1, hence the flow. At the first they do not: each side then has the
 For the surface that ends in the edge itself, F_θ = 0: its material does not pass its own border. What is left is the
 other side, light that something comes in between of, or no longer does.
 
-Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts or touches what
-it shines on, rays that leave it beside the cut start beyond that: the step there is missed.
+Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts into what it
+shines on, both sides are looked at a little off the cut (`chain_outline.beside_cut`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
 from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
 from .chain_fixed import Directions
-from .chain_outline import Curve, beside_line
+from .chain_outline import Curve, beside_cut, beside_line
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
@@ -154,15 +154,17 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     p = line.at(found.at.lo)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     Φ = _intensity(line, line.direction(p), wavelengths) * weight
+    ends = pair.a, pair.b
     if lines.world.patterns is not None:
         pair = beside_line(job.scene, pair, curve)
+    pair = beside_cut(job.scene, pair, curve)
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 
     valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (mi.Point3f(line.y), line.direction(q)))
     per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
-    for i, hit in enumerate((pair.a, pair.b)):
+    for i, hit in enumerate(ends):
         landed, g = _sent_on(job, pair, i, Φ, wavelengths)
         g += dr.select(pair.seen ^ mi.Bool(i == 1), at_end, 0)
         value = job.call.counters.rejected.keep_finite(g * dr.select(mi.Bool(i == 1), -per_F, per_F))

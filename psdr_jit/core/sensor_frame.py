@@ -109,6 +109,22 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
     )
 
 
+def film_area(sensor: mi.Sensor, kind: str) -> mi.Float:
+    """Area that the film sees at distance 1 (orthographic: anywhere), up to a constant; attached to the sensor.
+
+    Of rays through three corners: no turn of the sensor changes the volume that their directions span, nor what they
+    have along its axis.
+    """
+    corners = mi.Point2f([0, 1, 0], [0, 0, 1])
+    ray, _ = sensor.sample_ray(0, 0.5, corners, mi.Point2f(0.5))
+    axis = dr.normalize(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
+    o, d = ([dr.gather(mi.Vector3f, mi.Vector3f(v), i) for i in range(3)] for v in (ray.o, ray.d))
+    if kind == "orthographic":
+        return dr.abs(dr.dot(dr.cross(o[1] - o[0], o[2] - o[0]), axis))
+    x = [v / dr.dot(v, axis) for v in d]
+    return dr.abs(dr.dot(x[0], dr.cross(x[1], x[2])))
+
+
 def _stretch(to_world: mi.Transform4f) -> tuple[mi.Float, mi.Float]:
     """Area factor across and length factor along the view: an orthographic pose carries the sensor's width."""
     x, y, z = (to_world @ axis for axis in (mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1)))

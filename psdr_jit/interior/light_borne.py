@@ -13,11 +13,11 @@ relative derivatives, and that of |dA_1|. How light crowds on a receiver is not 
 make it, and no Jacobian of the chain is needed. The price is that h is smooth; a box filter has no ∇h.
 
 As y_1 stays, the outline of a body as the light sees it is no discontinuity: E cosθ_1 goes to 0 there, and a sheet
-keeps its edge. The camera moves as if everything else moved the other way.
+keeps its edge. The camera moves as if everything else moved the other way; what else changes J, such as the field of
+view, is a factor of its own (`footprint`).
 
 Not in here: that something else comes between the light and y_1, that a later vertex goes past an edge, and that y_s
-goes behind something that hides it from the camera: `boundary/light_chain.py`. Nor that a pixel sees another area J
-when the field of view changes: `record` warns of that.
+goes behind something that hides it from the camera: `boundary/light_chain.py`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ from ..core.ad import accumulate, backpropagate, tangents
 from ..core.records import Hit
 from ..core.sensor_frame import look_at
 from ..core.varying import varying
-from ..core.warn_once import warn_once
-from ..errors import UnsupportedError, UnsupportedWarning
+from ..errors import UnsupportedError
 from ..paths.bounce import PathLimits, particle_eval
 from ..paths.delta_step import delta_step
 from ..paths.light_source import LightStart
@@ -99,14 +98,6 @@ def record(
             'use a smooth reconstruction filter, <rfilter type="gaussian"/>, or light_paths="off", which leaves that '
             "light out"
         )
-    if any(name.endswith("x_fov") for name in job.facts.sensor.pose):
-        warn_once(
-            "while the field of view is differentiated, light of points by way of mirrors and smooth glass moves over "
-            "the film, but does not get brighter or darker as pixels see more or less of what it shines on; move the "
-            "camera instead",
-            UnsupportedWarning,
-            job.call.memory,
-        )
     records = ParticleRecords(dr.width(path.p), depth)
     sound = _write(path, start, subpath, limits, records)
     records.count = dr.select(sound, path.count, 0)
@@ -145,7 +136,7 @@ def _relative(w: mi.Spectrum) -> mi.Spectrum:
 
 
 def _leave(found: LightBorne, moves: Displacements) -> tuple[mi.Point3f, mi.Vector3f, mi.Spectrum]:
-    """Origin on the light, direction to y_1, and E cosθ_1 |dA_1| relative to what it is. Attached."""
+    """Origin on the light, direction to y_1, and E cosθ_1 |dA_1| over the pixel, relative to what it is. Attached."""
     active = found.records.count > 0
     hit, _ = found.records.vertex(mi.UInt32(0), active)
     emitter = dr.reinterpret_array(mi.EmitterPtr, found.start.emitter)
@@ -155,6 +146,8 @@ def _leave(found: LightBorne, moves: Displacements) -> tuple[mi.Point3f, mi.Vect
     o = mi.Point3f(found.start.y + moved)
     lit, d, measure = material_segment(o, hit, found.wavelengths, moves, active)
     projected = measure * dr.relative_grad(dr.squared_norm(lit.p - o))  # cosθ_1 |dA_1|
+    if found.job.facts.camera_moves:
+        projected /= moves.footprint(found.job.frame.kind, found.path.film, found.path.aperture)
     lit.p = lit.p - moves.of_lights()
     _, E = emitter.sample_direction(lit, mi.Point2f(0.5), active)
     return o, d, _relative(E) * projected

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from ..core.ad import tangents
 from ..core.records import Hit
+from ..core.sensor_frame import film_area
 from ..paths.tube_surface import surface_at
 from ..scene.tubes import Tubes
 
@@ -58,6 +59,12 @@ class Displacements(ABC):
     @abstractmethod
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """The same material point with all that is known of it; `ray` is that of `hit`."""
+
+    @abstractmethod
+    def footprint(self, kind: str, film: mi.Point2f, aperture: mi.Point2f) -> mi.Float:
+        """Area across the camera ray through a fixed film position that a pixel sees at a fixed distance, relative to
+        what it is: of value 1, and changed by what is no motion of the sensor alone. `kind`: of the sensor.
+        """
 
     @abstractmethod
     def of_lights(self) -> mi.Vector3f:
@@ -138,6 +145,12 @@ class SceneDisplacements(Displacements):
 
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         return surface_at(self.tubes, hit.intersection(), ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+
+    def footprint(self, kind: str, film: mi.Point2f, aperture: mi.Point2f) -> mi.Float:
+        ray, _ = self.sensor.sample_ray(0, 0.5, film, aperture)
+        cos_θ = dr.dot(ray.d, dr.normalize(self.sensor.world_transform() @ mi.Vector3f(0, 0, 1)))
+        # r² cos³θ of the area at distance 1; a parallel view has θ = 0
+        return dr.relative_grad(film_area(self.sensor, kind)) * dr.relative_grad(cos_θ * dr.square(cos_θ))
 
     def of_lights(self) -> mi.Vector3f:
         return mi.Vector3f(0)

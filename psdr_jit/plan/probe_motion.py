@@ -113,6 +113,9 @@ class ProbeDisplacements(Displacements):
         si.n, si.sh_frame = _turned(si, self._turn_of(hit.shape))
         return si
 
+    def footprint(self, kind: str, film: mi.Point2f, aperture: mi.Point2f) -> mi.Float:
+        return mi.Float(1)  # as of every rigid motion
+
     def of_lights(self) -> mi.Vector3f:
         return self.v if self.probe.lights else mi.Vector3f(0)
 

@@ -115,6 +115,26 @@ def test_no_path_is_longer_than_it_may_be(llvm, max_depth, lit):
     assert forward(motion, bdpt(**steps, max_depth=max_depth), 1, 0).any() == lit
 
 
+def sunk_cube() -> mi.Scene:
+    """A cube of glass in the floor; all light enters by its top, is reflected by its sides, and stays inside."""
+    T = mi.ScalarTransform4f
+    pose = T().look_at(origin=[-1.6, 1.0, 1.6], target=[-0.35, -1, 0.35], up=[0, 1, 0])
+    return mi.load_dict({
+        "type": "scene", "lamp": spot([0.8, 2.2, -0.6], [0, -0.5, 0], 5), "floor": floor(),
+        "camera": {"type": "perspective", "to_world": pose, "film": film(), "fov": 40},
+        "body": {"type": "cube", "to_world": T().translate([0, -0.8, 0]).rotate([0, 1, 0], 25).scale(0.3),
+                 "bsdf": {"type": "psdr_dielectric"}},
+    }, optimize=False)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_sunk_cube_hides_the_floor_inside_of_it(llvm):
+    """Also where that is a few units in the last place from its wall, and from what the sensor sees."""
+    motion = perturb(sunk_cube(), "body.vertex_positions", direction=X)
+    steps = {"form": "spatial", "sppc": 0, "sppp": 0, "spps": 256, "sppd": 0, "sppi": 0}
+    assert not forward(motion, bdpt(**steps, max_depth=4), 1, 0).any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("param, how, scene", CASES, ids=lambda value: "")
 def test_glass(llvm, param, how, scene):
