@@ -12,7 +12,7 @@ waits for the next kernel; so do, while there are many, intervals that take long
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
 ends agree otherwise. Crossings of segments before `lines.first_kept` are not kept either: of camera rays, those of the
-first segment belong to the primary boundary.
+first segment belong to the primary boundary. Nor are places where chains choose another lobe.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ AT_REST = 2.0**-4
 FIRST_LOOKS = 2
 
 #: As few searches as this are followed to their ends, however long; but no more crossings than SLOTS in one kernel.
+#: Where there are more, a search pauses before it halves: it then finds one at most.
 FEW, SLOTS, UNLIMITED = 16384, 8, 2**31
 
 
@@ -109,11 +110,12 @@ LOOK, HALVE, CHECK, END = range(4)
 
 
 class Finds:
-    """Crossings of `lanes` searches, up to SLOTS each, with what lies in front of each. Not a PyTree."""
+    """Crossings of `lanes` searches, up to `slots` each, with what lies in front of each. Not a PyTree."""
 
-    def __init__(self, lanes: int):
+    def __init__(self, lanes: int, slots: int):
         self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
-        n = lanes * SLOTS
+        self.slots = varying(mi.UInt32, slots)
+        n = lanes * slots
         self.crossing = Crossing(Interval.made(dr.zeros, n), dr.zeros(mi.UInt32, n))
         self.before = Interval.made(dr.zeros, n)
         self.found, self.goes_on = dr.zeros(mi.Bool, n), dr.zeros(mi.Bool, n)
@@ -121,7 +123,7 @@ class Finds:
 
     def write(self, slot: mi.UInt32, find: tuple[mi.Bool, Crossing], before: tuple, active: mi.Bool) -> None:
         """`find`: (is it kept, the crossing); `before`: (does its search go on, the interval in front of it)."""
-        i, active = slot * self.stride + self.lane, active & (slot < SLOTS)
+        i, active = slot * self.stride + self.lane, active & (slot < self.slots)
         (kept, crossing), (goes_on, interval) = find, before
         pairs = ((self.crossing, crossing), (self.before, interval), (self.found, kept),
                  (self.goes_on, goes_on))  # fmt: skip
@@ -156,7 +158,7 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         crossed &= ~again
         front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
-        find = moves & (pair.k >= lines.first_kept), Crossing(where, pair.k)
+        find = moves & ~pair.chosen & (pair.k >= lines.first_kept), Crossing(where, pair.k)
         finds.write(slot, find, _part(front, mi.Bool(True), lines.narrowest), crossed)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
@@ -170,7 +172,7 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         at = dr.select(halved, at, dr.select(crossed, behind, part))
         search = Search(at, mode, lo, hi, moves)
         looks += dr.select(look, mi.UInt32(1), 0)
-        pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == SLOTS))) | (apart & before_halving)
+        pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == finds.slots))) | (apart & before_halving)
         active = (mode != END) & ~pauses
     return search
 
@@ -205,7 +207,7 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     found, looks = [], FIRST_LOOKS
     while left is not None:
         many = _width(left) > FEW
-        finds = Finds(_width(left))
+        finds = Finds(_width(left), 1 if many else SLOTS)
         pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
         search = _searched(lines, left, pause, finds)
         dr.eval(search, finds.crossing, finds.before, finds.found, finds.goes_on)

@@ -45,9 +45,8 @@ class SearchedLines(ABC):
         """Draw the directions of all lines."""
         sample = dr.arange(mi.UInt32, self.count)
         sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
-        line, s = self.line(sample), sampler.next_1d()
-        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
-        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
+        ray = self.ray(self.line(sample), sampler.next_1d())
+        guide(self.world, ray, self._numbers(sample), sampler, sample, self.directions)
         dr.eval(self.directions.data)
 
     def _numbers(self, sample: mi.UInt32):
