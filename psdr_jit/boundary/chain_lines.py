@@ -56,7 +56,7 @@ class Lines(SearchedLines):
     def of(job: Job) -> Lines:
         world = ChainWorld.of(job)
         samples = FilmSamples.over(job.film, job.spp, job.density)
-        lines = Lines(job, world, samples, Directions(samples.count, world.depth))
+        lines = Lines(job, world, samples, Directions(samples.count if world.scatters else 0, world.depth))
         lines.guide()
         return lines
 

@@ -49,9 +49,19 @@ def smooth_choice(bsdf: mi.BSDFPtr, k: mi.UInt32, u: mi.Float) -> tuple[mi.Bool,
 
 
 def leave(
-    si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool, ctx: mi.BSDFContext
+    si: mi.SurfaceInteraction3f,
+    k: mi.UInt32,
+    u: mi.Point2f,
+    fixed: Direction | None,
+    active: mi.Bool,
+    ctx: mi.BSDFContext,
 ) -> Leaving:
-    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses. `ctx` tells what is carried."""
+    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses. `ctx` tells what is carried.
+
+    `fixed`: None where no surface scatters light.
+    """
+    if fixed is None:
+        return _delta_leave(si, ctx, u.y, active)
     bsdf = si.bsdf()
     smooth, share = smooth_choice(bsdf, k, u.x)
     smooth &= active

@@ -51,6 +51,7 @@ class ChainWorld:
     camera: mi.Bool  # may they because the camera does, ...
     lights: mi.Bool  # ... or because lights do?
     connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
+    scatters: bool  # are there such vertices at all?
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
 
     @staticmethod
@@ -69,6 +70,7 @@ class ChainWorld:
             camera=varying(mi.Bool, facts.camera_moves),
             lights=varying(mi.Bool, lights),
             connects=compare_light,
+            scatters=facts.scatters,
             mode=mi.TransportMode.Radiance,
         )
 
@@ -218,9 +220,11 @@ def trace_pair(
         u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
 
-        pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
-        active &= ~pair.differs
-        direction = directions.read(pair.k, line, active)
+        direction = None
+        if dr.hint(world.scatters, mode="scalar"):
+            pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
+            active &= ~pair.differs
+            direction = directions.read(pair.k, line, active)
         on_a = leave(a, pair.k, u.lobe, direction, active, ctx)
         on_b = leave(b, pair.k, u.lobe, direction, active, ctx)
         pair.chosen = on_a.by_delta & on_b.by_delta & (on_a.through != on_b.through)

@@ -42,7 +42,9 @@ class SearchedLines(ABC):
         """Width at which halving ends."""
 
     def guide(self) -> None:
-        """Draw the directions of all lines."""
+        """Draw the directions of all lines, if anything scatters light."""
+        if not self.world.scatters:
+            return
         sample = dr.arange(mi.UInt32, self.count)
         sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
         ray = self.ray(self.line(sample), sampler.next_1d())
