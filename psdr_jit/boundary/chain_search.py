@@ -7,6 +7,9 @@ Every crossing is then found with expected weight 1, and the cost is that of 1/(
 factor n is found with a weight larger by n/s, and seen by so many fewer lines that each power of n adds 1/s to the
 variance of a corner, times n − 1: what is too narrow to matter is not looked for.
 
+Where a line of a pattern is crossed, texture coordinates tell roughly where: halving then looks close beside that place
+first, on the one side and on the other.
+
 As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind. What lies in front
 waits for the next kernel; so do, while there are many, intervals that take longer than others.
 
@@ -25,6 +28,7 @@ import mitsuba as mi
 from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
+from .chain_patterns import NO_FAMILY
 from .searched_lines import SearchedLines
 
 #: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
@@ -33,6 +37,13 @@ PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
 
 #: Width at which halving ends on steps that rest [px]: they are only walked around.
 AT_REST = 2.0**-4
+
+#: How far beside the place that texture coordinates tell halving looks, times the squared width of the interval [1/px]:
+#: as the error of a linear guess.
+BESIDE = 0.125
+
+#: No such place.
+NOWHERE = -1.0
 
 #: Looks at an interval and its halves in the first kernel; each further one has twice as many.
 FIRST_LOOKS = 2
@@ -98,12 +109,21 @@ class Search:
     lo: mi.Float
     hi: mi.Float
     moves: mi.Bool  # can the step that it halves to?
+    guess: mi.Float  # where it is, or NOWHERE
+
+    def middle(self, least: mi.Float) -> mi.Float:
+        """Where the interval [lo, hi] is cut."""
+        off = dr.maximum(BESIDE * dr.square(self.hi - self.lo), 0.25 * least)
+        beside = self.guess + dr.select(self.guess - self.lo < self.hi - self.guess, off, -off)
+        inside = (self.guess > self.lo) & (self.guess < self.hi) & (beside > self.lo) & (beside < self.hi)
+        return dr.select(inside, beside, 0.5 * (self.lo + self.hi))
 
     @staticmethod
     def begin(at: Interval) -> Search:
         n = dr.width(at.sample)
         nothing = dr.zeros(mi.Float, n)
-        return Search(at, dr.full(mi.UInt32, LOOK, n), nothing, mi.Float(nothing), dr.zeros(mi.Bool, n))
+        return Search(at, dr.full(mi.UInt32, LOOK, n), nothing, mi.Float(nothing), dr.zeros(mi.Bool, n),
+                      dr.full(mi.Float, NOWHERE, n))  # fmt: skip
 
 
 LOOK, HALVE, CHECK, END = range(4)
@@ -143,7 +163,7 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
     looks, slot, active = mi.UInt32(0), mi.UInt32(0), search.mode != END
     while dr.hint(active, label="psdr.chain.search", exclude=[lines, finds, most_looks, before_halving, least]):
         at, look, halve = search.at, search.mode == LOOK, search.mode == HALVE
-        middle = 0.5 * (search.lo + search.hi)
+        middle = search.middle(least)
         start = dr.select(look, at.lo, search.lo)
         end = dr.select(look, at.hi, dr.select(halve, middle, search.hi))
         pair = lines.compare(at.sample, (start, end))
@@ -170,7 +190,8 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         mode = dr.select(halved, dr.select(narrow, mi.UInt32(CHECK), HALVE), LOOK)
         mode = dr.select(ends, END, mode)
         at = dr.select(halved, at, dr.select(crossed, behind, part))
-        search = Search(at, mode, lo, hi, moves)
+        told = dr.select(pair.family != NO_FAMILY, start + pair.where * (end - start), NOWHERE)
+        search = Search(at, mode, lo, hi, moves, dr.select(apart | first, told, search.guess))
         looks += dr.select(look, mi.UInt32(1), 0)
         pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == finds.slots))) | (apart & before_halving)
         active = (mode != END) & ~pauses

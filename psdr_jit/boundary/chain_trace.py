@@ -96,6 +96,7 @@ class Pair:
     in_light: mi.Bool  # they part in what they see of `light` from the end of segment k, which they share
     seen: mi.Bool  # it is the first that sees it
     family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
+    where: mi.Float  # between the chains that line lies: share of the way from a to b, roughly
     light: LightPoint
     a: Hit  # segment k of each, or the shadow rays from its end
     b: Hit
@@ -107,7 +108,7 @@ class Pair:
         no, hit = mi.Bool(False), Hit.made(dr.zeros, 1)
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         k, family, β = mi.UInt32(0), mi.UInt32(NO_FAMILY), mi.Spectrum(1)
-        return Pair(k, no, no, no, no, mi.Bool(True), no, no, family, light, hit, hit, β, β)
+        return Pair(k, no, no, no, no, mi.Bool(True), no, no, family, mi.Float(0.5), light, hit, hit, β, β)
 
     @property
     def last(self) -> mi.UInt32:
@@ -212,9 +213,9 @@ def trace_pair(
             store.write(pair.k, pair.a, active)
         pair.differs = ~same_surface(world, a, b, ray_a.d, ray_b.d)
         if dr.hint(world.patterns is not None, mode="scalar"):
-            crossed, family = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
+            crossed, family, where = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
             pair.differs |= crossed
-            pair.family = dr.select(active, family, pair.family)
+            pair.family, pair.where = dr.select(active, family, pair.family), dr.select(active, where, pair.where)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
         pair.moves |= world.moves(a.shape, b.shape)
         u = Numbers.draw(rng)
@@ -259,6 +260,7 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
         in_light=parts,
         seen=seen_a,
         family=pair.family,
+        where=pair.where,
         light=dr.select(parts, light, pair.light),
         a=dr.select(parts, hit_a, pair.a),
         b=dr.select(parts, hit_b, pair.b),
