@@ -15,7 +15,8 @@ waits for the next kernel; so do, while there are many, intervals that take long
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
 ends agree otherwise. Crossings of segments before `lines.first_kept` are not kept either: of camera rays, those of the
-first segment belong to the primary boundary. Nor are places where chains choose another lobe.
+first segment belong to the primary boundary. Nor are places where chains choose another lobe; what lies in front of one
+is looked at as a whole.
 """
 
 from __future__ import annotations
@@ -179,7 +180,10 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
         find = moves & ~pair.chosen & (pair.k >= lines.first_kept), Crossing(where, pair.k)
-        finds.write(slot, find, _part(front, mi.Bool(True), lines.narrowest), crossed)
+        goes_on, before = _part(front, mi.Bool(True), lines.narrowest)
+        whole = pair.chosen & (front.hi - front.lo > lines.narrowest)  # its ends have not been compared
+        before = goes_on | whole, dr.select(whole, front, before)
+        finds.write(slot, find, before, crossed)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         chosen, part = _part(at, pair.specular | checked, lines.narrowest)
