@@ -1,6 +1,6 @@
 """Does the error keep falling? RMSE of a derivative image over three decades of samples, and its log-log slope.
 
-    python -m benchmarks.convergence               (15 minutes; append to benchmarks/results/convergence.jsonl)
+    python -m benchmarks.convergence               (25 minutes; append to benchmarks/results/convergence.jsonl)
 
 A mean over N independent renders is compared with a reference of at least 10 times the samples of the largest N, made
 from other seeds; the reference agrees with finite differences (`benchmarks.checks`). A bias would show as a floor.
@@ -45,6 +45,9 @@ CASES = (
     Case("box sunk into a floor", "sunk_box", "box.vertex_positions", Y),
     Case("thin lens, with shadows", "thinlens_shadow", "blocker.vertex_positions", X),
     Case("cbox contact, depth 4", "cbox", "small-box.vertex_positions", X, {"max_depth": 4, "rr_depth": 100}),
+    Case("two mirrors, depth 6", "mirrors", "blocker.vertex_positions", X),
+    Case("glass ball, depth 6", "glass", "body.to_world", X),
+    Case("light in a mirror", "reflected_light", "mirror.to_world", X),
 )
 
 
@@ -70,11 +73,12 @@ def errors(case: Case, res: int) -> dict[str, Any]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--res", type=int, default=32)
+    parser.add_argument("--cases", metavar="A,B", default="", help="only cases whose name contains one of these words")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
     args = parser.parse_args()
     scene_io.use_variant(args.variant)
-    for case in CASES:
+    for case in (case for case in CASES if any(word in case.name for word in args.cases.split(","))):
         result = errors(case, args.res)
         settings = {"scene": case.scene, "parameter": case.param, "res": args.res, "spp": SPP, "renders": DECADES,
                     "reference_spp": REFERENCE_SPP, "reference_renders": REFERENCE_RENDERS, **case.load}  # fmt: skip

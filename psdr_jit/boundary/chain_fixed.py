@@ -1,4 +1,4 @@
-"""What all chains of a line across the film have in common: directions, choices of lobes, and points of light.
+"""What all chains of a line across the film have in common: directions, random numbers, and points of light.
 
 The spatial form keeps the directions in which smooth vertices are left, and points of light on their material
 (`interior/spatial.py`). Its integrand is a function of the film point, for given directions and points of light, and it
@@ -6,7 +6,6 @@ is that function whose steps are looked for. So both must be drawn without regar
 
     direction     from a mixture of equal parts of what the surface prefers that a chain from a random point of the
                   line (the *guide*) meets there, and of the whole sphere; where the guide has ended, the sphere alone
-    delta lobe    of two, in shares that follow the lobes' values at the guide's vertex
     light point   on an emitter by its area, or as a direction to the sky
 
 The share of the sphere bounds the weights of chains that meet another surface than the guide does.
@@ -26,28 +25,24 @@ from ..paths.rays import shadow_hit
 #: Share of directions that are drawn from the whole sphere.
 SPHERE_SHARE = 0.5
 
-#: Share of the reflected one of two delta lobes where the guide tells nothing.
-EVEN = 0.5
-
 
 @dataclass
 class Direction:
-    """In which a smooth vertex is left, and how often by which delta lobe. Detached."""
+    """In which a smooth vertex is left. Detached."""
 
     ω: mi.Vector3f  # unit, world space
     pdf: mi.Float  # per solid angle [1/sr]; 0: the path ends
-    reflected: mi.Float  # share of the reflected one of two delta lobes
 
 
 class Directions:
     """Those of the first `depth` vertices of `lines`, vertex-major. Not a PyTree, so never loop state."""
 
-    BYTES = 20  # of one vertex
+    BYTES = 16  # of one vertex
 
     def __init__(self, lines: int, depth: int):
         self.stride = varying(mi.UInt32, lines)
         n = lines * depth
-        self.data = Direction(dr.zeros(mi.Vector3f, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
+        self.data = Direction(dr.zeros(mi.Vector3f, n), dr.zeros(mi.Float, n))
         dr.make_opaque(self.data)
 
     def write(self, k: mi.UInt32, line: mi.UInt32, direction: Direction) -> None:
@@ -66,7 +61,7 @@ def draw_direction(si: mi.SurfaceInteraction3f, sampler, smooth: mi.Bool) -> Dir
     wasted = preferred & ((bs.pdf == 0) | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
     ω = dr.select(preferred, si.to_world(bs.wo), ω)
     pdf = SPHERE_SHARE * dr.inv_four_pi + (1 - SPHERE_SHARE) * bsdf.pdf(ctx, si, si.to_local(ω), smooth)
-    return Direction(ω, dr.select(wasted, 0, dr.select(smooth, pdf, dr.inv_four_pi)), mi.Float(EVEN))
+    return Direction(ω, dr.select(wasted, 0, dr.select(smooth, pdf, dr.inv_four_pi)))
 
 
 @dataclass

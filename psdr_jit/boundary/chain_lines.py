@@ -1,7 +1,7 @@
 """The lines on the film that are searched for steps of what is seen in mirrors and behind glass (`chain_search`).
 
-Every sample is a line across one pixel, horizontal or vertical. What its chains have in common, directions and shares
-of lobes, is drawn before they are traced (`chain_fixed`).
+Every sample is a line across one pixel, horizontal or vertical. What its chains have in common, the directions in
+which they leave smooth vertices, is drawn before they are traced (`chain_fixed`).
 """
 
 from __future__ import annotations
@@ -56,14 +56,15 @@ class Lines(SearchedLines):
     def of(job: Job) -> Lines:
         world = ChainWorld.of(job)
         samples = FilmSamples.over(job.film, job.spp, job.density)
-        lines = Lines(job, world, samples, Directions(samples.count, world.depth))
+        lines = Lines(job, world, samples, Directions(samples.count if world.scatters else 0, world.depth))
         lines.guide()
         return lines
 
     def line(self, sample: mi.UInt32) -> Line:
         rng = self.samples.sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample)
         corner = self.samples.corner_of(self.samples.place(sample)[0])
-        horizontal, offset = rng.next_1d() < 0.5, rng.next_1d()
+        u = rng.next_2d()  # together: half of the lines are horizontal, and their offsets well spread among themselves
+        horizontal, offset = u.x < 0.5, u.y
         aperture, wavelength = rng.next_2d(), rng.next_1d()
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
         return Line(start, horizontal, aperture, wavelength)

@@ -1,7 +1,9 @@
 """How the chains of a line leave their vertices: by the reflected lobe, the one that leads through, or a smooth one.
 
-Which one is a matter of random numbers and of shares that the line keeps (`chain_fixed`), wherever on a surface the
-vertex is. The shares follow the guides, so that few chains go where little light comes from, but for a defensive rest.
+Of two delta lobes each is chosen as often as the BSDF would where the vertex is, but for a defensive rest. The choice
+may then change along the line, its random number being the same; that is no step of what is seen: with probability p(x)
+of a lobe at the place x, a crossing there brings 1/p(x) of what it does by that lobe, and is met with probability p(x).
+The search finds such places as it does crossings (`chain_search`), and leaves them.
 """
 
 from __future__ import annotations
@@ -13,10 +15,10 @@ import mitsuba as mi
 
 from ..paths.bounce import particle_eval
 from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
-from .chain_fixed import EVEN, Direction
+from .chain_fixed import Direction
 
-#: Least share of the chains that are reflected, and that are let through, where a surface does both.
-LOBE_SHARE = 0.1
+#: Least probability of either of two delta lobes.
+LEAST_LOBE = 0.1
 
 #: Share of the chains that go on by a smooth lobe where a surface has both kinds.
 SMOOTH_SHARE = 0.5
@@ -30,6 +32,7 @@ class Leaving:
     factor: mi.Spectrum  # value of the lobe over the probability of its choice
     alive: mi.Bool
     by_delta: mi.Bool
+    through: mi.Bool  # by the one that leads through the surface
 
 
 def has_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
@@ -46,20 +49,31 @@ def smooth_choice(bsdf: mi.BSDFPtr, k: mi.UInt32, u: mi.Float) -> tuple[mi.Bool,
 
 
 def leave(
-    si: mi.SurfaceInteraction3f, k: mi.UInt32, u: mi.Point2f, fixed: Direction, active: mi.Bool, ctx: mi.BSDFContext
+    si: mi.SurfaceInteraction3f,
+    k: mi.UInt32,
+    u: mi.Point2f,
+    fixed: Direction | None,
+    active: mi.Bool,
+    ctx: mi.BSDFContext,
 ) -> Leaving:
-    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses. `ctx` tells what is carried."""
+    """Go on from vertex `k`: in the `fixed` direction, or by a delta lobe; `u` chooses. `ctx` tells what is carried.
+
+    `fixed`: None where no surface scatters light.
+    """
+    if fixed is None:
+        return _delta_leave(si, ctx, u.y, active)
     bsdf = si.bsdf()
     smooth, share = smooth_choice(bsdf, k, u.x)
     smooth &= active
-    onward = _delta_leave(si, ctx, (u.y, fixed.reflected), active & ~smooth)
+    onward = _delta_leave(si, ctx, u.y, active & ~smooth)
     if ctx.mode == mi.TransportMode.Importance:
         f = particle_eval(si, bsdf, fixed.ω, smooth)
     else:
         f = bsdf.eval(ctx, si, si.to_local(fixed.ω), smooth)
     ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
     factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
-    return Leaving(ray, factor, (smooth & dr.any(factor != 0)) | onward.alive, onward.alive)
+    alive = (smooth & dr.any(factor != 0)) | onward.alive
+    return Leaving(ray, factor, alive, onward.alive, onward.through)
 
 
 def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
@@ -69,36 +83,23 @@ def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
     return mi.has_flag(flags, mi.BSDFFlags.DeltaReflection), passes
 
 
-def _delta_leave(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, choice: tuple, active: mi.Bool) -> Leaving:
-    """By the reflected lobe or the one that leads through; `choice`: (random number, share of the reflected one)."""
-    u, share = choice
-    reflects, passes = _delta_kinds(si.bsdf())
-    through = passes & (~reflects | (u >= share))
-    probability = dr.select(reflects & passes, dr.select(through, 1 - share, share), 1)
-    value, bs = _lobe(si, ctx, through, active & (reflects | passes))
-    alive = dr.any(value != 0)
-    return Leaving(si.spawn_ray(si.to_world(bs.wo)), dr.select(alive, value / probability, 0), alive, alive)
+def _delta_leave(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, u: mi.Float, active: mi.Bool) -> Leaving:
+    """By the reflected lobe or the one that leads through, as the random number `u` has it.
 
-
-def _lobe(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, through: mi.Bool, active: mi.Bool):
-    """`(value, sample)` of the delta lobe that leads through the surface, or of the other one; 0 if it has none."""
-    bsdf, number = si.bsdf(), dr.select(through, mi.Float(LAST_LOBE), FIRST_LOBE)
-    bs, weight = bsdf.sample(ctx, si, number, mi.Point2f(0.5), active)
+    Where one of two lobes is not there, such as in total reflection, every choice leads to the other one.
+    """
+    bsdf = si.bsdf()
+    reflects, passes = _delta_kinds(bsdf)
+    two = reflects & passes
+    number = dr.select(u < LEAST_LOBE, FIRST_LOBE, (u - LEAST_LOBE) / (1 - 2 * LEAST_LOBE))
+    number = dr.select(two, dr.minimum(number, LAST_LOBE), dr.select(passes, mi.Float(LAST_LOBE), FIRST_LOBE))
+    bs, weight = bsdf.sample(ctx, si, number, mi.Point2f(0.5), active & (reflects | passes))
     crosses = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) < 0
+    through = passes & (~reflects | crosses)
     there = active & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (bs.pdf > 0) & (crosses == through)
     null = there & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     value = dr.select(null, bsdf.eval_null_transmission(si, null), weight * bs.pdf)
-    return dr.select(there, value, 0), bs
-
-
-def reflected_share(of: tuple, active: tuple) -> mi.Float:
-    """Share of the chains that are reflected: as the guides' vertices `of` do, on average, but for a defensive rest."""
-    total, count, ctx = mi.Float(0), mi.Float(0), mi.BSDFContext()
-    for si, alive in zip(of, active, strict=True):
-        reflects, passes = _delta_kinds(si.bsdf())
-        both = alive & reflects & passes
-        r, t = (dr.mean(mi.unpolarized_spectrum(_lobe(si, ctx, mi.Bool(p), both)[0])) for p in (False, True))
-        known = both & (r + t > 0)
-        total += dr.select(known, r / (r + t), 0)
-        count += dr.select(known, mi.Float(1), 0)
-    return dr.select(count > 0, LOBE_SHARE + (1 - 2 * LOBE_SHARE) * total / count, EVEN)
+    probability = dr.select(two & (bs.pdf < 1), LEAST_LOBE + (1 - 2 * LEAST_LOBE) * bs.pdf, 1)
+    alive = there & dr.any(value != 0)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    return Leaving(ray, dr.select(alive, value / probability, 0), alive, alive, through)

@@ -77,18 +77,24 @@ class ChainPatterns:
         dr.eval(families, tables)
         return ChainPatterns(families, tables[0], tables[1], max(count), tables[2], tables[3])
 
-    def crossed(self, a, b, active: mi.Bool) -> tuple[mi.Bool, mi.UInt32]:
-        """`(has one been, its family)` between two hits of one surface; no family: it was an edge between faces."""
+    def crossed(self, a, b, active: mi.Bool) -> tuple[mi.Bool, mi.UInt32, mi.Float]:
+        """`(has one been, its family, where)` between two hits of one surface; no family: it was an edge between faces.
+
+        Where: the share of the way from a to b, as if texture coordinates changed evenly.
+        """
         shape = dr.select(active, dr.reinterpret_array(mi.UInt32, a.shape), 0)
         start, count = dr.gather(mi.UInt32, self.start, shape), dr.gather(mi.UInt32, self.count, shape)
         differs = active & (dr.gather(mi.UInt32, self.by_face, shape) != 0) & (a.prim_index != b.prim_index)
-        number = mi.UInt32(NO_FAMILY)
+        number, where = mi.UInt32(NO_FAMILY), mi.Float(0.5)
         for i in range(self.most):
             family = self.family(start + i, active & (i < count))
-            apart = active & (i < count) & (family.cell(a.uv) != family.cell(b.uv))
+            place_a, place_b, cell_a = family.place(a.uv), family.place(b.uv), family.cell(a.uv)
+            apart = active & (i < count) & (cell_a != family.cell(b.uv))
+            border = cell_a + dr.select(place_b > place_a, 1, 0)
+            where = dr.select(apart & ~differs, (border - place_a) / (place_b - place_a), where)
             number = dr.select(apart & ~differs, start + i, number)
             differs |= apart
-        return differs, number
+        return differs, number, where
 
     def family(self, number: mi.UInt32, active) -> Family:
         return dr.gather(Family, self.families, number, active)

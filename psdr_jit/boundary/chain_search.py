@@ -7,12 +7,16 @@ Every crossing is then found with expected weight 1, and the cost is that of 1/(
 factor n is found with a weight larger by n/s, and seen by so many fewer lines that each power of n adds 1/s to the
 variance of a corner, times n − 1: what is too narrow to matter is not looked for.
 
+Where a line of a pattern is crossed, texture coordinates tell roughly where: halving then looks close beside that place
+first, on the one side and on the other.
+
 As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind. What lies in front
 waits for the next kernel; so do, while there are many, intervals that take longer than others.
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
 ends agree otherwise. Crossings of segments before `lines.first_kept` are not kept either: of camera rays, those of the
-first segment belong to the primary boundary.
+first segment belong to the primary boundary. Nor are places where chains choose another lobe; what lies in front of one
+is looked at as a whole.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import mitsuba as mi
 from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
+from .chain_patterns import NO_FAMILY
 from .searched_lines import SearchedLines
 
 #: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
@@ -34,10 +39,18 @@ PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
 #: Width at which halving ends on steps that rest [px]: they are only walked around.
 AT_REST = 2.0**-4
 
+#: How far beside the place that texture coordinates tell halving looks, times the squared width of the interval [1/px]:
+#: as the error of a linear guess.
+BESIDE = 0.125
+
+#: No such place.
+NOWHERE = -1.0
+
 #: Looks at an interval and its halves in the first kernel; each further one has twice as many.
 FIRST_LOOKS = 2
 
 #: As few searches as this are followed to their ends, however long; but no more crossings than SLOTS in one kernel.
+#: Where there are more, a search pauses before it halves: it then finds one at most.
 FEW, SLOTS, UNLIMITED = 16384, 8, 2**31
 
 
@@ -97,23 +110,33 @@ class Search:
     lo: mi.Float
     hi: mi.Float
     moves: mi.Bool  # can the step that it halves to?
+    guess: mi.Float  # where it is, or NOWHERE
+
+    def middle(self, least: mi.Float) -> mi.Float:
+        """Where the interval [lo, hi] is cut."""
+        off = dr.maximum(BESIDE * dr.square(self.hi - self.lo), 0.25 * least)
+        beside = self.guess + dr.select(self.guess - self.lo < self.hi - self.guess, off, -off)
+        inside = (self.guess > self.lo) & (self.guess < self.hi) & (beside > self.lo) & (beside < self.hi)
+        return dr.select(inside, beside, 0.5 * (self.lo + self.hi))
 
     @staticmethod
     def begin(at: Interval) -> Search:
         n = dr.width(at.sample)
         nothing = dr.zeros(mi.Float, n)
-        return Search(at, dr.full(mi.UInt32, LOOK, n), nothing, mi.Float(nothing), dr.zeros(mi.Bool, n))
+        return Search(at, dr.full(mi.UInt32, LOOK, n), nothing, mi.Float(nothing), dr.zeros(mi.Bool, n),
+                      dr.full(mi.Float, NOWHERE, n))  # fmt: skip
 
 
 LOOK, HALVE, CHECK, END = range(4)
 
 
 class Finds:
-    """Crossings of `lanes` searches, up to SLOTS each, with what lies in front of each. Not a PyTree."""
+    """Crossings of `lanes` searches, up to `slots` each, with what lies in front of each. Not a PyTree."""
 
-    def __init__(self, lanes: int):
+    def __init__(self, lanes: int, slots: int):
         self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
-        n = lanes * SLOTS
+        self.slots = varying(mi.UInt32, slots)
+        n = lanes * slots
         self.crossing = Crossing(Interval.made(dr.zeros, n), dr.zeros(mi.UInt32, n))
         self.before = Interval.made(dr.zeros, n)
         self.found, self.goes_on = dr.zeros(mi.Bool, n), dr.zeros(mi.Bool, n)
@@ -121,7 +144,7 @@ class Finds:
 
     def write(self, slot: mi.UInt32, find: tuple[mi.Bool, Crossing], before: tuple, active: mi.Bool) -> None:
         """`find`: (is it kept, the crossing); `before`: (does its search go on, the interval in front of it)."""
-        i, active = slot * self.stride + self.lane, active & (slot < SLOTS)
+        i, active = slot * self.stride + self.lane, active & (slot < self.slots)
         (kept, crossing), (goes_on, interval) = find, before
         pairs = ((self.crossing, crossing), (self.before, interval), (self.found, kept),
                  (self.goes_on, goes_on))  # fmt: skip
@@ -141,7 +164,7 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
     looks, slot, active = mi.UInt32(0), mi.UInt32(0), search.mode != END
     while dr.hint(active, label="psdr.chain.search", exclude=[lines, finds, most_looks, before_halving, least]):
         at, look, halve = search.at, search.mode == LOOK, search.mode == HALVE
-        middle = 0.5 * (search.lo + search.hi)
+        middle = search.middle(least)
         start = dr.select(look, at.lo, search.lo)
         end = dr.select(look, at.hi, dr.select(halve, middle, search.hi))
         pair = lines.compare(at.sample, (start, end))
@@ -156,8 +179,11 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         crossed &= ~again
         front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
-        find = moves & (pair.k >= lines.first_kept), Crossing(where, pair.k)
-        finds.write(slot, find, _part(front, mi.Bool(True), lines.narrowest), crossed)
+        find = moves & ~pair.chosen & (pair.k >= lines.first_kept), Crossing(where, pair.k)
+        goes_on, before = _part(front, mi.Bool(True), lines.narrowest)
+        whole = pair.chosen & (front.hi - front.lo > lines.narrowest)  # its ends have not been compared
+        before = goes_on | whole, dr.select(whole, front, before)
+        finds.write(slot, find, before, crossed)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         chosen, part = _part(at, pair.specular | checked, lines.narrowest)
@@ -168,9 +194,10 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         mode = dr.select(halved, dr.select(narrow, mi.UInt32(CHECK), HALVE), LOOK)
         mode = dr.select(ends, END, mode)
         at = dr.select(halved, at, dr.select(crossed, behind, part))
-        search = Search(at, mode, lo, hi, moves)
+        told = dr.select(pair.family != NO_FAMILY, start + pair.where * (end - start), NOWHERE)
+        search = Search(at, mode, lo, hi, moves, dr.select(apart | first, told, search.guess))
         looks += dr.select(look, mi.UInt32(1), 0)
-        pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == SLOTS))) | (apart & before_halving)
+        pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == finds.slots))) | (apart & before_halving)
         active = (mode != END) & ~pauses
     return search
 
@@ -205,7 +232,7 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     found, looks = [], FIRST_LOOKS
     while left is not None:
         many = _width(left) > FEW
-        finds = Finds(_width(left))
+        finds = Finds(_width(left), 1 if many else SLOTS)
         pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
         search = _searched(lines, left, pause, finds)
         dr.eval(search, finds.crossing, finds.before, finds.found, finds.goes_on)

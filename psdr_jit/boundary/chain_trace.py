@@ -1,10 +1,9 @@
 """Two neighbouring camera rays and the paths that they follow: where do they first part?
 
 A path leaves its first vertex by a delta lobe, and every other one by a delta lobe or in the direction that its line
-keeps for it (`chain_fixed`). Which lobe is a matter of random numbers, and of shares that the line keeps as well: the
-same for both paths wherever they are on a surface, so that nothing steps because of the choice. A path's throughput is
-the product of the lobes' values over these probabilities. Total reflection leaves the transmitted lobe without a
-direction; its value has gone to 0 before, so that a path may end there without a step.
+keeps for it (`chain_fixed`). Which lobe is a matter of random numbers that the line keeps as well, and of the vertex
+(`chain_lobes`): paths part where the choice changes, too, though what is seen does not step there. A path's throughput
+is the product of the lobes' values over their probabilities.
 
 Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
 shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
@@ -27,7 +26,7 @@ from ..edges.followed_lights import FollowedLights, followed_lights
 from ..plan.job import Job
 from ..plan.probe_motion import registry_table
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
-from .chain_lobes import has_delta, leave, reflected_share, smooth_choice
+from .chain_lobes import has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
@@ -53,6 +52,7 @@ class ChainWorld:
     camera: mi.Bool  # may they because the camera does, ...
     lights: mi.Bool  # ... or because lights do?
     connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
+    scatters: bool  # are there such vertices at all?
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
     followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
 
@@ -72,6 +72,7 @@ class ChainWorld:
             camera=varying(mi.Bool, facts.camera_moves),
             lights=varying(mi.Bool, lights),
             connects=compare_light,
+            scatters=facts.scatters,
             mode=mi.TransportMode.Radiance,
             followed=followed_lights(job),
         )
@@ -92,11 +93,13 @@ class Pair:
     k: mi.UInt32  # number of the segment, 0: from the sensor
     differs: mi.Bool
     specular: mi.Bool  # some vertex on the way, or where they part, has a delta lobe
+    chosen: mi.Bool  # they part by the choice of a lobe, which is no step of what is seen
     moves: mi.Bool  # something on the way, or where they part, can move: elsewhere a step stays where it is
     emits: mi.Bool  # does what segment k ends at count with its emission?
     in_light: mi.Bool  # they part in what they see of `light` from the end of segment k, which they share
     seen: mi.Bool  # it is the first that sees it
     family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
+    where: mi.Float  # between the chains that line lies: share of the way from a to b, roughly
     light: LightPoint
     a: Hit  # segment k of each, or the shadow rays from its end
     b: Hit
@@ -108,7 +111,7 @@ class Pair:
         no, hit = mi.Bool(False), Hit.made(dr.zeros, 1)
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         k, family, β = mi.UInt32(0), mi.UInt32(NO_FAMILY), mi.Spectrum(1)
-        return Pair(k, no, no, no, mi.Bool(True), no, no, family, light, hit, hit, β, β)
+        return Pair(k, no, no, no, no, mi.Bool(True), no, no, family, mi.Float(0.5), light, hit, hit, β, β)
 
     @property
     def last(self) -> mi.UInt32:
@@ -172,24 +175,19 @@ class Numbers:
 
 
 @dr.syntax
-def guide(world: ChainWorld, rays: tuple[mi.Ray3f, mi.Ray3f], rng, sampler, line: mi.UInt32, out: Directions):
-    """Follow two chains of every line and draw what it keeps: directions by the first, shares of lobes by both.
-
-    `rng` as for `trace_pair`. Fills `out`.
-    """
-    ray_a, ray_b, k = mi.Ray3f(rays[0]), mi.Ray3f(rays[1]), mi.UInt32(0)
-    in_a, in_b, ctx = mi.Bool(True), mi.Bool(True), mi.BSDFContext(world.mode)
+def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: Directions):
+    """Follow a chain of every line and draw the directions that it keeps. `rng` as for `trace_pair`. Fills `out`."""
+    ray, k, active = mi.Ray3f(ray), mi.UInt32(0), mi.Bool(True)
+    ctx = mi.BSDFContext(world.mode)
     while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out, ctx]):
-        a = world.scene.ray_intersect(ray_a, mi.RayFlags.All, False, in_a)
-        b = world.scene.ray_intersect(ray_b, mi.RayFlags.All, False, in_b)
-        in_a, in_b = in_a & a.is_valid(), in_b & b.is_valid()
+        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        active &= si.is_valid()
         u = Numbers.draw(rng)
-        smooth, _ = smooth_choice(a.bsdf(), k, u.lobe.x)
-        fixed = draw_direction(a, sampler, smooth & in_a)
-        fixed.reflected = reflected_share((a, b), (in_a, in_b))
+        smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
+        fixed = draw_direction(si, sampler, smooth & active)
         out.write(k, line, fixed)
-        on_a, on_b = leave(a, k, u.lobe, fixed, in_a, ctx), leave(b, k, u.lobe, fixed, in_b, ctx)
-        ray_a, in_a, ray_b, in_b = on_a.ray, on_a.alive, on_b.ray, on_b.alive
+        onward = leave(si, k, u.lobe, fixed, active, ctx)
+        ray, active = onward.ray, onward.alive
         k += 1
 
 
@@ -218,28 +216,32 @@ def trace_pair(
             store.write(pair.k, pair.a, active)
         pair.differs = ~same_surface(world, a, b, ray_a.d, ray_b.d)
         if dr.hint(world.patterns is not None, mode="scalar"):
-            crossed, family = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
+            crossed, family, where = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
             pair.differs |= crossed
-            pair.family = dr.select(active, family, pair.family)
+            pair.family, pair.where = dr.select(active, family, pair.family), dr.select(active, where, pair.where)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
         pair.moves |= world.moves(a.shape, b.shape)
         u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
 
-        pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
-        active &= ~pair.differs
-        direction = directions.read(pair.k, line, active)
+        direction = None
+        if dr.hint(world.scatters, mode="scalar"):
+            pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
+            active &= ~pair.differs
+            direction = directions.read(pair.k, line, active)
         on_a = leave(a, pair.k, u.lobe, direction, active, ctx)
         on_b = leave(b, pair.k, u.lobe, direction, active, ctx)
+        pair.chosen = on_a.by_delta & on_b.by_delta & (on_a.through != on_b.through)
+        pair.differs |= pair.chosen
         if dr.hint(store is not None, mode="scalar"):
             store.write_bend(pair.k, on_a.by_delta, active)
-        active = on_a.alive & on_b.alive
+        active = on_a.alive & on_b.alive & ~pair.chosen
         pair.k += dr.select(active, mi.UInt32(1), 0)
         pair.emits = dr.select(active, on_a.by_delta, pair.emits)
         pair.β_a *= dr.select(active, on_a.factor, 1)
         pair.β_b *= dr.select(active, on_b.factor, 1)
         ray_a, ray_b = on_a.ray, on_b.ray
-    pair.moves |= world.camera
+    pair.moves |= world.camera | pair.chosen
     return pair
 
 
@@ -257,11 +259,13 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
         k=pair.k,
         differs=pair.differs | parts,
         specular=pair.specular,
+        chosen=pair.chosen,
         moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))),
         emits=pair.emits,
         in_light=parts,
         seen=seen_a,
         family=pair.family,
+        where=pair.where,
         light=dr.select(parts, light, pair.light),
         a=dr.select(parts, hit_a, pair.a),
         b=dr.select(parts, hit_b, pair.b),

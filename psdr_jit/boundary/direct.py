@@ -40,7 +40,7 @@ from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..plan.plan import Geometry
-from ..plan.reasons import steps_rest
+from ..plan.reasons import NOTHING_SCATTERS, steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.guided import guided
 from ..sampling.horizons import horizon_weights
@@ -245,6 +245,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, steps_rest(facts)
     if options.depth_limit < 2:
         return False, "max_depth = 1: nothing is lit, so nothing is in shadow"
+    if not facts.scatters:
+        return False, NOTHING_SCATTERS
     if facts.has_light_steps:
         return True, "shadows move, and so do steps that lights bring along"
     if geometry.lone_convex:

@@ -27,7 +27,7 @@ from ..edges.table import EdgeTable, look_beside
 from ..options import Options
 from ..plan.job import Job
 from ..plan.plan import Geometry
-from ..plan.reasons import steps_rest
+from ..plan.reasons import NOTHING_SCATTERS, steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.horizons import horizon_weights, sampled_horizons
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
@@ -165,6 +165,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return True, f"what surfaces see of each other moves, and of '{geometry.touched_lamp}', which touches some"
     if options.depth_limit < 3:
         return False, f"max_depth = {options.depth_limit}: light is scattered once at most"
+    if not facts.scatters:
+        return False, NOTHING_SCATTERS
     if geometry.lone_convex:
         return False, f"'{geometry.lone_convex}' is alone and convex: it sees nothing but the sky"
     if not (facts.shapes_move or facts.camera_moves or facts.paths_bend):

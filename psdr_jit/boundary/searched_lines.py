@@ -42,12 +42,13 @@ class SearchedLines(ABC):
         """Width at which halving ends."""
 
     def guide(self) -> None:
-        """Draw the directions of all lines."""
+        """Draw the directions of all lines, if anything scatters light."""
+        if not self.world.scatters:
+            return
         sample = dr.arange(mi.UInt32, self.count)
         sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
-        line, s = self.line(sample), sampler.next_1d()
-        rays = self.ray(line, s), self.ray(line, dr.select(s < 0.5, s + 0.5, s - 0.5))
-        guide(self.world, rays, self._numbers(sample), sampler, sample, self.directions)
+        ray = self.ray(self.line(sample), sampler.next_1d())
+        guide(self.world, ray, self._numbers(sample), sampler, sample, self.directions)
         dr.eval(self.directions.data)
 
     def _numbers(self, sample: mi.UInt32):

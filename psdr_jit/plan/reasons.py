@@ -43,6 +43,10 @@ def what_changes(facts: SceneFacts) -> str:
     return ", ".join(text for there, text in kinds if there)
 
 
+#: Why nothing is in shadow, nor sees anything: said where all is black, a mirror or smooth glass.
+NOTHING_SCATTERS = "no surface scatters light: all are black, mirrors or smooth glass"
+
+
 def steps_rest(facts: SceneFacts) -> str | None:
     """Why no discontinuity moves, if none does."""
     return None if facts.geometry_moves else "no shape, light or camera moves: discontinuities stay where they are"

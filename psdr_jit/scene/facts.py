@@ -25,6 +25,7 @@ from .delta_lobes import bending, blends_delta, delta_lobes, lobes_not_followed,
 from .emitter_facts import EmitterFacts, emitter_facts
 from .graph import (
     SceneGraph,
+    is_black,
     is_cubic,
     is_turned_grid,
     is_unevenly_scaled,
@@ -58,6 +59,7 @@ class ShapeFacts:
     turned_grid: bool  # a grid of signed distances under one
     bsdf: str  # plugin, as written in XML
     bsdf_flags: int  # mi.BSDFFlags
+    black: bool  # it scatters nothing
     delta_lobes: tuple[str, ...]  # "dielectric: DeltaReflection", ...
     lost_weights: tuple[str, ...]  # enabled parameters of delta lobes whose derivative is not known, full names
     lost_varies: bool  # such a parameter, enabled or not, varies over the surface
@@ -140,6 +142,11 @@ class SceneFacts:
     @property
     def has_delta_lobes(self) -> bool:
         return any(shape.delta_lobes for shape in self.shapes)
+
+    @property
+    def scatters(self) -> bool:
+        """Some surface sends light in more directions than its delta lobes have."""
+        return any(shape.bsdf_flags & int(mi.BSDFFlags.Smooth) and not shape.black for shape in self.shapes)
 
     @property
     def has_light_steps(self) -> bool:
@@ -253,6 +260,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         turned_grid=is_turned_grid(graph, shape, plugin),
         bsdf=plugin_name(bsdf) if bsdf is not None else "none",
         bsdf_flags=bsdf.flags() if bsdf is not None else 0,
+        black=is_black(graph, bsdf),
         delta_lobes=delta_lobes(graph, bsdf),
         lost_weights=weights,
         lost_varies=varies,

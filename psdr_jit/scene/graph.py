@@ -158,6 +158,17 @@ def sees_frame(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
     return turned or any(plugin_name(node) not in FRAME_FREE_PLUGINS for node in known)
 
 
+def is_black(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
+    """Whether a BSDF scatters nothing and stays so, like the one that Mitsuba gives lights without one.
+
+    False where that is not known: other plugins, and while a function is being frozen.
+    """
+    if bsdf is None or plugin_name(bsdf) != "diffuse" or graph.enabled_from(bsdf):
+        return False
+    values = [_host(graph.value(texture, "value")) for texture in child_objects(bsdf)]
+    return all(value is not None and not value.any() for value in values)
+
+
 def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
     """Whether a texture varies over the surface and yet has no derivative with respect to the position.
 
