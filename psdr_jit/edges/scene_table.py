@@ -215,9 +215,10 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         limit = COARSE if job.scene.environment() is None else COARSE_UNDER_SKY
         # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.
         flips = job.facts.has_delta_emitters and job.options.depth_limit > 2
-        missing = [shape for shape, s in zip(shapes, meshes, strict=True)
-                   if s.smooth and (s.is_emitter or s.delta_lobes or flips or _lets_light_in(job, shape))]  # fmt: skip
-        warn_about_coarse(missing, limit, job.call.memory)
+        smooth = [(shape, s) for shape, s in zip(shapes, meshes, strict=True) if s.smooth]
+        sends = [shape for shape, s in smooth if s.is_emitter or s.delta_lobes or flips]
+        warn_about_coarse(sends, limit, job.call.memory)
+        warn_about_coarse([shape for shape, _ in smooth if _lets_light_in(job, shape)], COARSE, job.call.memory)
     return [ShadingOutlines(faces, centre)]
 
 
