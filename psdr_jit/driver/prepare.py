@@ -28,6 +28,7 @@ from ..plan.motion import SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
+from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
 from ..scene.shared_texcoords import warn_about_shared_texcoords
@@ -96,6 +97,8 @@ def prepare(call: Call) -> Prepared:
     facts = _facts(call)
     require_supported(facts, call.memory)
     warn_about_shared_texcoords(call.scene, facts, call.memory)
+    if call.options.hide_emitters:
+        warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":
         warn_about_stale_normals(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())

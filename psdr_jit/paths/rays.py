@@ -39,10 +39,10 @@ def skip_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection
     pi = mi.PreliminaryIntersection3f(pi)
     active = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array comparison)
     while dr.hint(active, label="psdr.skip_emitters"):
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal)
-        rest = ray.maxt - pi.t
-        ray = si.spawn_ray(ray.d)
-        ray.maxt = rest
+        behind = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal).spawn_ray(ray.d)
+        # its origin lies off the surface: measured from there, or rays would end as much later
+        behind.maxt = ray.maxt - dr.dot(behind.o - ray.o, ray.d)
+        ray = behind
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     return ray, pi
