@@ -110,10 +110,11 @@ def test_backward_is_the_transpose(mono, case):
 
 def test_the_plan_says_so_and_material_form_warns(mono):
     scene = sunk()
-    plan = psdr_jit.make_plan(scene, ["lamp.vertex_positions"], integrator={"type": "psdr_path", "max_depth": 2})
+    spec = {"type": "psdr_path", "max_depth": 2, "sppc": 1, "sppp": 1, "sppd": 1, "sppi": 1}  # as set: no pilot
+    plan = psdr_jit.make_plan(scene, ["lamp.vertex_positions"], integrator=spec)
     assert plan.form == "spatial" and plan.term("indirect").runs and "'lamp'" in plan.term("indirect").reason
     apart = room(cube(0, 0.7, 0, 1, emitter=glow()))
-    plan = psdr_jit.make_plan(apart, ["lamp.vertex_positions"], integrator={"type": "psdr_path", "max_depth": 2})
+    plan = psdr_jit.make_plan(apart, ["lamp.vertex_positions"], integrator=spec)
     assert not plan.term("indirect").runs
     motion = perturb(scene, "lamp.vertex_positions", X)
     with pytest.warns(UnsupportedWarning, match="'lamp' touches 'floor'"):
