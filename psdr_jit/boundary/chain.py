@@ -34,7 +34,7 @@ from ..core.ad import accumulate, tangents
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
-from ..edges.followed_lights import followed_lights
+from ..edges.followed_lights import is_followed
 from ..options import Options
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
@@ -112,9 +112,8 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), i)
     ray = mi.Ray3f(hit.o, hit.d, 0, dr.gather(type(wavelengths), wavelengths, i))
     limits = job.limits.beyond(of.k)
-    pi, emits, followed = hit.intersection(), of.emits, followed_lights(job)
-    if followed is not None:
-        emits = emits | followed.has(pi.shape.emitter(), pi.is_valid())
+    pi = hit.intersection()
+    emits = of.emits | is_followed(job, pi.shape.emitter(), pi.is_valid())
     L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), emits, ~of.in_light)
     L = L * β
     dr.eval(L)

@@ -31,7 +31,7 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
-from ..edges.followed_lights import followed_lights
+from ..edges.followed_lights import is_followed
 from ..edges.kind import Use
 from ..edges.location import EdgeLocation
 from ..edges.points import LEAST_SLANT, start_height
@@ -118,9 +118,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     """The lines that end on a receiver and on a visible emitter; all others are left out (value 0)."""
     scene, light, on = job.scene, line.light, line.light.on
     active = light.valid & (light.pdf > 0) & dr.any(light.value != 0)
-    followed = followed_lights(job)
-    if followed is not None:
-        active &= ~followed.has(light.emitter, active)
+    active &= ~is_followed(job, light.emitter, active)
 
     # Towards the source: closest hit, so that the point on an area light can be attached.
     on_surface = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Surface)

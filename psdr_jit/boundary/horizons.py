@@ -21,7 +21,7 @@ from ..core.line_guide import NO_CELL, Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
-from ..edges.followed_lights import followed_lights
+from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
@@ -160,8 +160,7 @@ def trace_lights(job: Job, horizons: SampledHorizons, line: HorizonLine) -> LitH
     emitter = si.emitter(job.scene)
     wanted = dr.gather(mi.UInt32, horizons.table.targets.emitter, on.target)
     met = dr.reinterpret_array(mi.UInt32, emitter)
-    followed = followed_lights(job)
-    active = mi.Bool(True) if followed is None else ~followed.has(emitter, met != 0)
+    active = ~is_followed(job, emitter, met != 0)
     active &= (met != 0) & ((wanted == 0) | (met == wanted)) & ~partner_agrees(pi)
     L = dr.select(active, emitter.eval(si, active), 0)
     finite = pi.is_valid()

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from ..core import film as films
 from ..core.streams import Stream
-from ..edges.followed_lights import followed_lights
+from ..edges.followed_lights import is_followed
 from ..edges.kind import Use
 from ..edges.table import EdgeTable, look_beside
 from ..options import Options
@@ -93,9 +93,7 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
     ray, pi, differs = look_beside(job.scene, table, v.sight, which, v.wavelengths)
-    lights = followed_lights(job)
-    meets = differs & pi.is_valid()
-    followed = dr.full(mi.Bool, False, dr.width(index)) if lights is None else lights.has(pi.shape.emitter(), meets)
+    followed = is_followed(job, pi.shape.emitter(), differs & pi.is_valid())
     # the emission of others is seen by delta lobes, and taken off again for smooth ones
     emission = mi.Bool(True) if job.facts.has_delta_lobes else followed
     return *radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission), followed

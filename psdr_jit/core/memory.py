@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+import drjit as dr
+
+K = TypeVar("K")
 T = TypeVar("T")
 
 
@@ -29,3 +32,20 @@ class Memory:
 
     def __setitem__(self, slot: Slot[T], value: T) -> None:
         self._kept[slot] = value
+
+
+def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:
+    """Are these JIT arrays, one by one, those that were kept?
+
+    A variable that is kept keeps its index, and whatever writes to a parameter replaces its variable by another.
+    Values are not compared, nor derivatives.
+    """
+    return [a.index for a in kept] == [a.index for a in arrays]
+
+
+def while_unchanged(kept: dict[K, tuple[list[Any], T]], key: K, arrays: list[Any], make: Callable[[], T]) -> T:
+    """What `make()` returned for `key`, made anew once one of the arrays it is made from has been replaced."""
+    arrays = [dr.detach(array) for array in arrays]
+    if key not in kept or not same_arrays(kept[key][0], arrays):
+        kept[key] = (arrays, make())
+    return kept[key][1]

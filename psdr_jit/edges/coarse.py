@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import mesh_buffers, mesh_faces, mesh_positions
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 
@@ -20,8 +20,8 @@ BENT, BENT_SHARE = 5.0, 0.02
 #: through which the plane of every face passes.
 COARSE, COARSE_UNDER_SKY = 35.0, 20.0
 
-#: Of an integrator: by name of a mesh, its arrays when it was looked at, kept alive, and whether it is bent.
-BENT_MESHES: Slot[dict[str, tuple[tuple, bool]]] = Slot(dict)
+#: Of an integrator: by name of a mesh, its arrays when it was looked at, and whether it is bent.
+BENT_MESHES: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
 
 #: Of an integrator: the meshes that have been looked at for a warning, by name, and with which limit.
 LOOKED_AT: Slot[set[tuple[str, float]]] = Slot(set)
@@ -36,15 +36,11 @@ def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
 
 
 def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
-    name, buffers = mesh.id(), mesh_buffers(mesh)
-    known = memory[BENT_MESHES].get(name)
-    # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
-    new = known is None or [b.index for b in known[0]] != [b.index for b in buffers]
-    if new and not dr.flag(dr.JitFlag.FreezingScope):
-        with dr.suspend_grad():
-            known = (buffers, _bent_share(mesh, BENT) > BENT_SHARE)
-        memory[BENT_MESHES][name] = known
-    return known is None or known[1]
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return memory[BENT_MESHES].get(mesh.id(), ([], True))[1]
+    with dr.suspend_grad():
+        kept, buffers = memory[BENT_MESHES], list(mesh_buffers(mesh))
+        return while_unchanged(kept, mesh.id(), buffers, lambda: _bent_share(mesh, BENT) > BENT_SHARE)
 
 
 def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> None:

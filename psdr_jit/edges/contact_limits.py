@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers, mesh_faces
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
@@ -31,7 +31,6 @@ STANDS_OFF = 0.05
 
 #: Of an integrator: by the names of a light and of what touches it, the contact and whether they meet at an angle.
 ANGLES: Slot[dict[tuple[str, str], tuple[Contact, bool]]] = Slot(dict)
-
 
 #: Of an integrator: by the name of a light that touches something, its arrays, and whether it is shaded smooth.
 BENT: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
@@ -90,12 +89,7 @@ def shaded_smooth(lamp: mi.Shape, memory: Memory) -> bool:
     """Do Mitsuba's weights of samples of the light follow other normals than those of its faces?"""
     if not lamp.is_mesh() or not is_smooth(lamp):
         return False
-    buffers = [dr.detach(buffer) for buffer in mesh_buffers(lamp)]
-    known = memory[BENT].get(lamp.id())
-    if known is None or [b.index for b in known[0]] != [b.index for b in buffers]:
-        known = (buffers, _bent(lamp))
-        memory[BENT][lamp.id()] = known
-    return known[1]
+    return while_unchanged(memory[BENT], lamp.id(), list(mesh_buffers(lamp)), lambda: _bent(lamp))
 
 
 def _bent(mesh: mi.Mesh) -> bool:

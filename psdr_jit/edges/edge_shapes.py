@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, same_arrays
 from ..errors import UnsupportedError
 from ..plan.job import Job
 from ..scene.capabilities import COPIES
@@ -119,7 +119,7 @@ def _group(memory: Memory, index: int, instance: mi.Shape, groups: dict[str, lis
 def _copy(job: Job, key: tuple[int, int], instance: mi.Shape, child: mi.Shape, facts: ShapeFacts) -> mi.Shape:
     arrays = _arrays(instance, child)
     known = job.call.memory[KNOWN].get(key)
-    if known is None or known.child is not child or [a.index for a in known.arrays] != [a.index for a in arrays]:
+    if known is None or known.child is not child or not same_arrays(known.arrays, arrays):
         name = f"{job.facts.shapes[key[0]].name}: {facts.name}"
         known = _Copy(child, arrays, copied(child, facts.plugin, instance, name))
         job.call.memory[KNOWN][key] = known

@@ -56,6 +56,12 @@ def followed_lights(job: Job) -> FollowedLights | None:
     return job.shared[FOLLOWED][0]
 
 
+def is_followed(job: Job, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
+    """Is the emission of these followed along directions? A literal if it is in no case."""
+    lights = followed_lights(job)
+    return mi.Bool(False) if lights is None else lights.has(emitter, active)
+
+
 def _found(job: Job) -> FollowedLights | None:
     if not _boxes_touch(job):
         return None

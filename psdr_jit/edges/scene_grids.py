@@ -5,14 +5,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.memory import Slot
+from ..core.memory import Slot, while_unchanged
 from ..plan.job import Job
 from ..scene.grids import TO_WORLD, VALUES
 from .edge_shapes import GridPlace, edge_shapes
 from .grid_set import GridSet, grid_set
 
-#: Of an integrator: what grids were made from, and these grids.
-KNOWN: Slot[tuple[list, GridSet] | None] = Slot(lambda: None)
+#: Of an integrator: by how many places grids are shown in, what they were made from, and these grids.
+KNOWN: Slot[dict[int, tuple[list, GridSet]]] = Slot(dict)
 
 
 def scene_grids(job: Job) -> GridSet | None:
@@ -21,12 +21,7 @@ def scene_grids(job: Job) -> GridSet | None:
     if not places or any(place.facts.moves for place in places):
         return grid_set(places)
     arrays = [array for place in places for array in _arrays(place)]
-    known = job.call.memory[KNOWN]
-    # whatever changes an array replaces it by another; those that are kept keep their index
-    if known is None or [a.index for a in known[0]] != [a.index for a in arrays]:
-        known = (arrays, grid_set(places))
-        job.call.memory[KNOWN] = known
-    return known[1]
+    return while_unchanged(job.call.memory[KNOWN], len(places), arrays, lambda: grid_set(places))
 
 
 def _arrays(place: GridPlace) -> list:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers
-from ..core.memory import Slot
+from ..core.memory import Slot, same_arrays
 from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
 from ..core.varying import varying
@@ -131,9 +131,7 @@ def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> Ed
     buffers = [dr.detach(buffer) for shape in shapes for buffer in mesh_buffers(shape)]
     buffers += [on_sides for on_sides in seams if on_sides is not None]
     known = job.call.memory[STRAIGHT]
-    # a buffer that is kept keeps its index, and whatever writes to a mesh gives it another buffer
-    same = known is not None and known[1] == moving and [b.index for b in known[0]] == [b.index for b in buffers]
-    if not same:
+    if known is None or known[1] != moving or not same_arrays(known[0], buffers):
         known = (buffers, moving, edge_set(shapes, moving, job.call.memory, seams=seams))
         job.call.memory[STRAIGHT] = known
     return replace(known[2], meshes=tuple(shapes))

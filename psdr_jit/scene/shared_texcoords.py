@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, texcoords_buffer
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
@@ -28,12 +28,10 @@ def warn_about_shared_texcoords(scene: mi.Scene, facts: SceneFacts, memory: Memo
     """Name painted lights whose faces, taken together, are larger than the part of the texture that they show."""
     if dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read
         return
-    shapes = scene.shapes()
-    for emitter in facts.emitters:
-        if emitter.plugin != "area" or not emitter.varies or emitter.shape < 0:
-            continue
-        shape, index = facts.shapes[emitter.shape], facts.shapes[emitter.shape].index
-        if shape.is_mesh and shape.has_texcoords and index >= 0 and _overlap(shapes[index], memory):
+    painted = [e.shape for e in facts.emitters if e.plugin == "area" and e.varies and e.shape >= 0]
+    for shape in (facts.shapes[k] for k in painted):
+        mapped = shape.is_mesh and shape.has_texcoords and shape.index >= 0
+        if mapped and _overlap(scene.shapes()[shape.index], memory):
             warn_once(
                 f"the area light '{shape.name}' has a texture, and several of its points have the same texture "
                 "coordinates: Mitsuba samples one of them only, so that the image itself is wrong; give every point a "
@@ -45,11 +43,7 @@ def warn_about_shared_texcoords(scene: mi.Scene, facts: SceneFacts, memory: Memo
 
 def _overlap(mesh: mi.Mesh, memory: Memory) -> bool:
     buffers = [dr.detach(texcoords_buffer(mesh)), dr.detach(faces_buffer(mesh))]
-    known = memory[OVERLAPS].get(mesh.id())
-    if known is None or [b.index for b in known[0]] != [b.index for b in buffers]:
-        known = (buffers, _covers_twice(*(np.array(b) for b in buffers)))
-        memory[OVERLAPS][mesh.id()] = known
-    return known[1]
+    return while_unchanged(memory[OVERLAPS], mesh.id(), buffers, lambda: _covers_twice(*(np.array(b) for b in buffers)))
 
 
 def _covers_twice(texcoords: np.ndarray, faces: np.ndarray) -> bool:
