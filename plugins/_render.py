@@ -144,7 +144,7 @@ def _require_gradient_image(grad_in, expected) -> None:
             "every pixel and channel"
         )
     # NaN would end up as a gradient of 0: the sweeps mask what is not finite
-    if not dr.flag(dr.JitFlag.FreezingScope) and not dr.all(dr.isfinite(mi.TensorXf(grad_in)), axis=None):
+    if not dr.all(dr.isfinite(mi.TensorXf(grad_in)), axis=None):
         raise ParameterError(
             "grad_in is not finite: the loss or its derivative overflowed; look for logarithms and divisions by pixels "
             "that are 0"

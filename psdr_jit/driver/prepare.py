@@ -17,7 +17,7 @@ from ..core.film import require_film
 from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..edges.followed_lights import followed_lights
-from ..errors import OptionError, ZeroDerivativeWarning
+from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
 from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
@@ -89,6 +89,7 @@ class _Question:
 
 def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
+    _require_unfrozen()
     film = call.film
     require_film(film)
     given = _given(call.options)
@@ -110,6 +111,15 @@ def prepare(call: Call) -> Prepared:
     by_name = {term.name: term for term in TERMS}
     return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t)) for t in plan.running], log,
                     lambda spp: question.job(plan, spp))  # fmt: skip
+
+
+def _require_unfrozen() -> None:
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise UnsupportedError(
+            "derivatives cannot be recorded by dr.freeze: which paths and edges matter is read back in every call; "
+            "freeze what is around it, such as the loss or what makes the parameters, and render and differentiate "
+            "outside of the frozen function (images alone can be frozen)"
+        )
 
 
 def _spread(plan: Plan, measured: Measurement) -> Plan:
@@ -198,7 +208,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     if not plan.running or (len(forms) == 1 and not automatic):
         return plan, None
     log = call.memory[NOISE].setdefault((call.options, *_kind(q, forms), *budgets.values()), NoiseLog())
-    if log.needs_pilot and not dr.flag(dr.JitFlag.FreezingScope):  # which records, but must not read back
+    if log.needs_pilot:
         # Terms that are switched off here as well: integrators of one term each must agree on the form.
         names = [term.name for term in made(dict.fromkeys(budgets, 1), (forms[0], ""), "").running]
         log.pilot(_pilot(q, plan, forms, names, log.epoch))
@@ -215,8 +225,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     if log.share is None:
         return plan, log
     plan = made(*log.share)
-    spreads = automatic and not dr.flag(dr.JitFlag.FreezingScope)
-    return _spread(plan, log.current) if spreads else plan, log
+    return _spread(plan, log.current) if automatic else plan, log
 
 
 def _geometry(q: _Question, prunes: bool) -> Geometry:

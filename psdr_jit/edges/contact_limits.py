@@ -59,7 +59,7 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
     lights that are followed on their material (`followed_lights.py` says which are not) the emission: the derivative by
     the camera is 10 to 15 % off for a cube of light in a floor, that of a box that sinks into a lamp 11 %.
     """
-    if job.options.depth_limit < 2 or dr.flag(dr.JitFlag.FreezingScope):
+    if job.options.depth_limit < 2:
         return
     memory = job.call.memory
     if contacts.movers is not None and job.form == "material" and job.options.depth_limit > 2:

@@ -31,7 +31,7 @@ CLEAR = 1e-3
 
 def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
     """Name the shapes whose contact the motion opens, each pair once."""
-    if job.call.mode != "forward" or dr.flag(dr.JitFlag.FreezingScope):
+    if job.call.mode != "forward":
         return
     velocities: dict[int, np.ndarray] = {}
     for contact in contacts:

@@ -93,8 +93,6 @@ class EllipsoidOutlines(ContourKind):
 
 def warn_about_touching(bodies: Ellipsoids, memory: Memory) -> None:
     """Name shapes whose ellipsoids may cut into each other, as their boxes overlap, once each."""
-    if dr.flag(dr.JitFlag.FreezingScope):
-        return
     count = dr.width(bodies.first)
     body = bodies.ellipsoid(dr.arange(mi.UInt32, count), mi.Bool(True))
     columns = [body.vector(mi.Vector3f(*(float(k == axis) for k in range(3)))) for axis in range(3)]

@@ -135,8 +135,6 @@ def _moves(chosen: list[ShapeFacts], lines: PatternSet) -> mi.Bool:
 
 def _shape_patterns(job: Job, facts: ShapeFacts) -> _Known:
     shape, known = edge_shapes(job).shapes[facts.index], job.call.memory[PATTERNS].get(facts.name)
-    if known is not None and dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read, and must not be others
-        return known
     is_curve = facts.kind == "curve"
     textures = pattern_textures_on_curve(shape) if is_curve else pattern_textures(shape)
     values: list[Any] = [*textures, *(dr.detach(value) for value in texture_values(textures))]

@@ -124,9 +124,7 @@ def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> Ed
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     moving = [s.moves for s in meshes]
     seams = [None if p is None else p.on_sides for p in patterns_of(job, meshes)]
-    # what is recorded for other values must not hold the edges of these
-    recorded = job.facts.shapes_move and dr.flag(dr.JitFlag.FreezingScope)
-    if balls or recorded or not job.plan.prunes:
+    if balls or not job.plan.prunes:
         return edge_set(shapes, moving, job.call.memory, balls, seams)
     buffers = [dr.detach(buffer) for shape in shapes for buffer in mesh_buffers(shape)]
     buffers += [on_sides for on_sides in seams if on_sides is not None]
@@ -187,8 +185,7 @@ def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[Edge
     """Edges that a path may reach, their rows, and how many others there are; None if there are only others."""
     total = dr.width(rows.v0)
     everything = dr.arange(mi.UInt32, total)
-    # while a function is being frozen, values cannot be read: nothing is left out
-    if not job.plan.prunes or dr.flag(dr.JitFlag.FreezingScope):
+    if not job.plan.prunes:
         return rows, everything, 0
     hidden = buried(job, rows, bodies)
     count = 0 if hidden is None else int(dr.count(hidden)[0])

@@ -24,12 +24,7 @@ AROUND = 1 / np.cos(np.pi / CORNERS)
 
 
 def cut_each_other(a: tuple[mi.Shape, str], b: tuple[mi.Shape, str]) -> bool:
-    """Do the surfaces of two `(shape, plugin)` cross? Curved ones are taken as polyhedra in and around them.
-
-    While a function is being frozen, values cannot be read: they may.
-    """
-    if dr.flag(dr.JitFlag.FreezingScope):
-        return True
+    """Do the surfaces of two `(shape, plugin)` cross? Curved ones are taken as polyhedra in and around them."""
     for outward in {1.0, AROUND}:
         triangles = [_triangles(shape, plugin, outward) for shape, plugin in (a, b)]
         boxes = [np.stack([t.min((0, 1)), t.max((0, 1))]) for t in triangles]

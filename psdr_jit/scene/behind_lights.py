@@ -30,8 +30,6 @@ class _Ball:
 
 def warn_about_shapes_behind_lights(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Name curved shapes of which balls around them say that a hidden light may be in front, once each."""
-    if dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read
-        return
     shapes = scene.shapes()
     known = [s for s in facts.shapes if s.index >= 0]
     lights = [_ball(shapes[s.index], s.name) for s in known if s.is_emitter]

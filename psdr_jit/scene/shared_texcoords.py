@@ -26,8 +26,6 @@ OVERLAPS: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
 
 def warn_about_shared_texcoords(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
     """Name painted lights whose faces, taken together, are larger than the part of the texture that they show."""
-    if dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read
-        return
     painted = [e.shape for e in facts.emitters if e.plugin == "area" and e.varies and e.shape >= 0]
     for shape in (facts.shapes[k] for k in painted):
         mapped = shape.is_mesh and shape.has_texcoords and shape.index >= 0

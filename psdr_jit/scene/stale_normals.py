@@ -25,7 +25,7 @@ def warn_about_stale_normals(scene: mi.Scene, facts: SceneFacts, memory: Memory)
     For backward mode: in forward mode the tangents have reached the normals before rendering. Each is named once.
     """
     smooth = [s for s in facts.shapes if s.smooth and s.index >= 0 and VERTEX_POSITIONS in s.geometry]
-    if not smooth or dr.flag(dr.JitFlag.FreezingScope):
+    if not smooth:
         return
     with dr.resume_grad():
         graph, shapes = dr.graphviz_ad(as_string=True), scene.shapes()

@@ -18,6 +18,8 @@ import numpy as np
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.check import FAIL, PASS
+from psdr_jit.derivative.perturbation import perturb
+from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.errors import PsdrError, UnsupportedWarning
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import ParamInfo, differentiable_params
@@ -28,6 +30,7 @@ COMPUTED, UNDECIDED, WARNED, REFUSED, WRONG, NOT_FINITE = (
 
 SIDE = 24  # longer side of the image [px]
 DEPTH = 3  # of paths, at most
+LOOK_SPP = 4  # of the derivative that tells whether there is one
 DIRECTION, AXIS = (0.6, 0.3, -0.5), (0.2, 1, 0.3)  # of motions
 TOLERANCE = 0.05  # of the gain: a few seconds of a noisy scene know no better
 
@@ -46,8 +49,11 @@ class Row:
         return asdict(self)
 
 
-def survey(folder: Path, seconds: float) -> Iterator[Row]:
-    """Rows of all scene files in `folder` and below; a check may take so many seconds."""
+def survey(folder: Path, seconds: float, most: int | None = None) -> Iterator[Row]:
+    """Rows of all scene files in `folder` and below; a check may take so many seconds, 0: nothing is checked.
+
+    `most`: how many things of a scene are moved, evenly spread over all that can be; None: all.
+    """
     for path in sorted(folder.rglob("*.xml")):
         start = time.perf_counter()
         try:
@@ -55,8 +61,15 @@ def survey(folder: Path, seconds: float) -> Iterator[Row]:
         except PsdrError as error:
             yield Row(path.name, "", REFUSED, None, None, str(error), time.perf_counter() - start)
             continue
-        for info in movable(scene):
+        for info in spread(movable(scene), most):
             yield row_of(scene, path.name, info, seconds)
+
+
+def spread(infos: list[ParamInfo], most: int | None) -> list[ParamInfo]:
+    """At most so many, the first and the last among them."""
+    if most is None or len(infos) <= most:
+        return infos
+    return [infos[k] for k in np.linspace(0, len(infos) - 1, most).round().astype(int)]
 
 
 def shrunk(scene: mi.Scene) -> mi.Scene:
@@ -86,8 +99,12 @@ def movable(scene: mi.Scene) -> list[ParamInfo]:
 
 
 def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
-    """Move one thing, and compare."""
+    """Move one thing, and compare if there are seconds for it."""
     start = time.perf_counter()
+
+    def row(word: str, reason: str = "", gain: float | None = None, stderr: float | None = None) -> Row:
+        return Row(file, info.name, word, gain, stderr, reason, time.perf_counter() - start)
+
     turned = info.kind == "emitter" and info.name.endswith("to_world")  # the sky and the sun are nowhere
     how = {"rotate": AXIS} if turned else {"direction": DIRECTION}
     spec = integrator_specs.integrator_spec(scene, "psdr_path")
@@ -97,18 +114,25 @@ def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            check = psdr_jit.check_gradient(scene, info.name, **how, integrator=integrator, max_seconds=seconds,
-                                            tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
+            look = DerivativeSampler(perturb(scene, info.name, **how), integrator, 0, LOOK_SPP)
+            look.add(1)
         except PsdrError as error:
-            return Row(file, info.name, REFUSED, None, None, str(error), time.perf_counter() - start)
-    verdict, missing = check.verdict, [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
-    word, reason = {PASS: COMPUTED, FAIL: WRONG}.get(verdict.verdict, UNDECIDED), verdict.reason
+            return row(REFUSED, str(error))
+    missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
+    if look.not_finite or not np.isfinite(look.images.mean()).all():
+        return row(NOT_FINITE, f"{look.not_finite} samples were not finite")
     if missing:
-        word, reason = WARNED, missing[0]
+        return row(WARNED, missing[0])
+    if seconds == 0:
+        return row(COMPUTED)
+    check = psdr_jit.check_gradient(scene, info.name, **how, integrator=integrator, max_seconds=seconds,
+                                    tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
+    verdict = check.verdict
     if integrator_specs.rejected(integrator) or not np.isfinite(check.estimate).all():
-        word, reason = NOT_FINITE, f"{integrator_specs.rejected(integrator)} samples were not finite"
+        return row(NOT_FINITE, f"{integrator_specs.rejected(integrator)} samples were not finite")
+    word = {PASS: COMPUTED, FAIL: WRONG}.get(verdict.verdict, UNDECIDED)
     gain, stderr = (x if np.isfinite(x) else None for x in (verdict.gain, verdict.gain_stderr))
-    return Row(file, info.name, word, gain, stderr, reason, time.perf_counter() - start)
+    return row(word, verdict.reason, gain, stderr)
 
 
 def table(rows: list[Row]) -> str:

@@ -1,6 +1,7 @@
 """Every scene file of a folder: nothing is wrong, not finite, or ends with an error that is not ours.
 
-`PSDR_CORPUS` names the folder, by default one of our own; `PSDR_CORPUS_OUT` one for the table and the rows.
+`PSDR_CORPUS` names the folder, by default one of our own; `PSDR_CORPUS_OUT` one for the table and the rows;
+`PSDR_CORPUS_SECONDS` how long a check may take, 0 for none; `PSDR_CORPUS_MOST` how many things of a scene are moved.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from psdr_jit.scene import io as scene_io
 OWN = Path(__file__).parent / "scenes"
 FOLDER = Path(os.environ.get("PSDR_CORPUS", OWN))
 SECONDS = float(os.environ.get("PSDR_CORPUS_SECONDS", "30"))  # a check
+MOST = int(os.environ["PSDR_CORPUS_MOST"]) if "PSDR_CORPUS_MOST" in os.environ else None
 
 
 @pytest.mark.slow
@@ -25,7 +27,7 @@ def test_scene_files(llvm, tmp_path):
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     with open(out / "corpus.jsonl", "w", encoding="utf-8") as file:
-        for row in survey(FOLDER, SECONDS):
+        for row in survey(FOLDER, SECONDS, MOST):
             rows.append(row)
             file.write(json.dumps(row.as_dict()) + "\n")
             file.flush()

@@ -103,12 +103,13 @@ def _examine(case: Mapping[str, Any], first: Effort, second: Effort) -> tuple[st
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UnsupportedWarning)
         try:
-            look = compare(motion, case, first)
+            _estimate(motion, case, first).add(1)
         except PsdrError as error:
             return REFUSED, str(error)
-    missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
-    if missing:
-        return WARNED, missing[0]
+        missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
+        if missing:
+            return WARNED, missing[0]
+        look = compare(motion, case, first)
     if not look.wrong:
         return (NOISY if look.blind else RIGHT), str(look)
     again = compare(motion, case, second, FINER)
@@ -125,8 +126,7 @@ def motion_of(case: Mapping[str, Any]) -> Perturbation:
 
 def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer: float = 1.0) -> Look:
     """Derivative and differences of `motion`, by independent seeds."""
-    estimate = DerivativeSampler(motion, integrator_specs.build(case["integrator"]), 0, effort.spp,
-                                 groups=GROUPS, first_seed=effort.first_seed)  # fmt: skip
+    estimate = _estimate(motion, case, effort)
     reference = _differences(motion, case, effort, finer)
     for sampler in (estimate, reference):
         sampler.add(effort.seeds)
@@ -146,6 +146,12 @@ def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer
     z = block_test(d, f, BLOCK, floor).max_z
     blocks = (block_means(d.mean(0), BLOCK), block_means(f.mean(0), BLOCK))
     return Look(gain(d, *halves), z, TOLERANCE, estimate.not_finite == 0, *blocks)
+
+
+def _estimate(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> DerivativeSampler:
+    """Nothing is rendered yet."""
+    integrator = integrator_specs.build(case["integrator"])
+    return DerivativeSampler(motion, integrator, 0, effort.spp, groups=GROUPS, first_seed=effort.first_seed)
 
 
 def _differences(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer: float) -> CentralDifference:
