@@ -5,7 +5,8 @@ The interior term follows such light from its side (`interior/light_borne.py`): 
 
     I = ∫ g(q) dω(q) …,        g = h(p) Φ(ω) Π_k w_k
 
-Φ the light's intensity [W/sr], w_k lobe by lobe, and at y_s the BSDF over the area that a pixel sees. The first
+Φ the light's intensity [W/sr], or the irradiance of a directional light, of which q is a place on a disk across its
+rays and dω its area; w_k lobe by lobe, and at y_s the BSDF over the area that a pixel sees. The first
 vertex y_1 stays on its surface, so q moves with it. g steps where two neighbouring paths part: where one goes past
 an edge, or where the sensor sees one of the two ends y_s only. Along a line X across q the crossed curve is met where
 F(X, θ) = 0, as seen by lines of the camera (`chain.py`). Then, with F_θ the derivative of F along the flow, y_1 fixed,
@@ -113,7 +114,7 @@ class LightSteps:
 
 
 def _intensity(line: LightLine, ω: mi.Vector3f, wavelengths) -> mi.Spectrum:
-    """Φ in the direction ω: the irradiance at a distance of 1."""
+    """Φ in the direction ω: the irradiance at a distance of 1, and of a directional light, at any."""
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p, si.wavelengths = line.y + ω, wavelengths
     _, E = dr.reinterpret_array(mi.EmitterPtr, line.emitter).sample_direction(si, mi.Point2f(0.5))
@@ -161,7 +162,7 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 
-    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (mi.Point3f(line.y), line.direction(q)))
+    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (line.origin(q), line.direction(q)))
     per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
     for i, hit in enumerate(ends):
@@ -190,11 +191,9 @@ def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> Ligh
 def _leave(moving: Displacements, side: Side) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The motion of the first segments, whose ends y_1 are fixed on their surfaces: of starts and directions."""
     hit = side.first
-    t = dr.select(hit.shape != 0, hit.t, 1)
-    it = dr.zeros(mi.Interaction3f)
-    it.p = hit.o + hit.d * t
-    of_light, _ = moving.of_light(dr.reinterpret_array(mi.EmitterPtr, side.emitter), it, mi.Bool(True))
-    across = (moving.of_surface(hit) - of_light) / t
+    r = dr.select(hit.shape != 0, hit.t, 1)
+    of_light = moving.of_light_start(dr.reinterpret_array(mi.EmitterPtr, side.emitter), hit, mi.Bool(True))
+    across = (moving.of_surface(hit) - of_light) / r
     return of_light, across - hit.d * dr.dot(hit.d, across)
 
 

@@ -6,8 +6,10 @@ disk of radius R that Lambert's azimuthal map makes of the cone which the ball i
     ω = x √(1 − r²/4) s + y √(1 − r²/4) t + (1 − r²/2) a,        r² = x² + y² ≤ R²,        dω = dx dy,
 
 (s, t, a) a frame about the axis a of the cone, R² = 2 (1 − cos of its half angle): areas are solid angles, and the map
-is smooth up to the whole sphere, seen from inside of the ball. The square around the disk is cut into CELLS² cells;
-every sample is a line across one of them. Where cones overlap, each has its share of what is in both.
+is smooth up to the whole sphere, seen from inside of the ball. Of a directional light all ω are a, and the film is the
+disk across them that the ball hides: rays start at c + x s + y t, in front of the scene. The square around the disk is
+cut into CELLS² cells; every sample is a line across one of them. Where cones overlap, each has its share of what is in
+both.
 
 Few cells see a step that matters. Lines of a pilot, a part of all, tell which; with one line, a cell's part of the
 derivative has a variance of about the mean square v of what lines found there, and the variance Σ v_i/n_i of all is
@@ -32,7 +34,7 @@ from ..core.sensor_frame import SensorFrame, View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.upload import uploaded
 from ..core.varying import varying
-from ..paths.light_source import LightSources, cone, place_of
+from ..paths.light_source import Ball, LightSources, beam_density, cone, in_beam, in_cone, is_far, place_of, shone
 from ..paths.light_technique import LightTechnique
 from ..paths.rays import skip_emitters
 from ..paths.sensor_connection import on_film
@@ -58,10 +60,11 @@ class LightLine:
     """The line of a sample across the directions of a light. Detached."""
 
     emitter: mi.UInt32  # registry index
-    y: mi.Point3f  # where it is
+    far: mi.Bool  # it is a directional one
+    y: mi.Point3f  # where it is; of a directional one, where the ray through the middle of the ball starts
     axis: mi.Vector3f  # of the cone
-    inverse_angle: mi.Float  # 1 / its solid angle
-    cell: mi.Float  # side of a cell in the chart: the root of its solid angle
+    density: mi.Float  # 1 / its solid angle, or 1 / area of the disk
+    cell: mi.Float  # side of a cell in the chart: the root of its solid angle, or of its area
     place: mi.UInt32  # number of the cell, among those of all lights and targets
     across: mi.Float  # expected number of lines of one direction across it
     start: mi.Point2f  # [cells]
@@ -74,10 +77,19 @@ class LightLine:
 
     def direction(self, p: mi.Point2f) -> mi.Vector3f:
         """ω at the position `p` [cells]; attached where `p` is."""
-        x, y = ((v - CELLS / 2) * self.cell for v in (p.x, p.y))
+        x, y = self._chart(p)
         r2 = dr.square(x) + dr.square(y)
         up = dr.safe_sqrt(1 - r2 / 4)
-        return dr.normalize(mi.Frame3f(self.axis).to_world(mi.Vector3f(x * up, y * up, 1 - r2 / 2)))
+        ω = dr.normalize(mi.Frame3f(self.axis).to_world(mi.Vector3f(x * up, y * up, 1 - r2 / 2)))
+        return dr.select(self.far, self.axis, ω)
+
+    def origin(self, p: mi.Point2f) -> mi.Point3f:
+        """Where the ray of the position `p` [cells] starts; attached where `p` is."""
+        x, y = self._chart(p)
+        return mi.Point3f(self.y + dr.select(self.far, mi.Frame3f(self.axis).to_world(mi.Vector3f(x, y, 0)), 0))
+
+    def _chart(self, p: mi.Point2f) -> tuple[mi.Float, mi.Float]:
+        return (p.x - CELLS / 2) * self.cell, (p.y - CELLS / 2) * self.cell
 
 
 @dataclass(frozen=True)
@@ -159,36 +171,53 @@ class LightLines(SearchedLines):
     def line(self, sample: mi.UInt32) -> LightLine:
         rng = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample)
         count, u = varying(mi.Float64, self.count), rng.next_1d()
-        place, _ = sample_edge(self.cells.distribution, (mi.Float64(sample) + mi.Float64(u)) / count)
-        across = pmf(self.cells.distribution, place) * mi.Float(count) / 2
-        square, cell = place // CELLS**2, place % CELLS**2
+        cell_of_all, _ = sample_edge(self.cells.distribution, (mi.Float64(sample) + mi.Float64(u)) / count)
+        across = pmf(self.cells.distribution, cell_of_all) * mi.Float(count) / 2
+        square, cell = cell_of_all // CELLS**2, cell_of_all % CELLS**2
         targets = len(self._targets)
         target = square % targets
         emitter = dr.gather(mi.UInt32, self.points, square // targets)
-        y = place_of(dr.reinterpret_array(mi.EmitterPtr, emitter), mi.Bool(True))
-        axis, inverse_angle = mi.Vector3f(0, 0, 1), mi.Float(1)
+        light = dr.reinterpret_array(mi.EmitterPtr, emitter)
+        far = mi.Bool(False) if self.sources.around is None else is_far(light)
+        place, y, axis, density = place_of(light, ~far), mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.Float(1)
         for i, ball in enumerate(self._targets):
-            this, _, inverse = cone(ball, y)
-            axis, inverse_angle = (dr.select(target == i, *v) for v in ((this, axis), (inverse, inverse_angle)))
+            seen = self._bundle(light, place, ball, far)
+            y, axis, density = (dr.select(target == i, *v) for v in zip(seen, (y, axis, density), strict=True))
         horizontal, offset, wavelength = rng.next_1d() < 0.5, rng.next_1d(), rng.next_1d()
         corner = mi.Point2f(mi.Float(cell % CELLS), mi.Float(cell // CELLS))
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
-        side = 2 / CELLS * dr.rsqrt(dr.pi * inverse_angle)  # R² = Ω/π
-        return LightLine(emitter, y, axis, inverse_angle, side, place, across, start, horizontal, wavelength)
+        side = 2 / CELLS * dr.rsqrt(dr.pi * density)  # R² = Ω/π
+        return LightLine(emitter, far, y, axis, density, side, cell_of_all, across, start, horizontal, wavelength)
+
+    def _bundle(
+        self, light: mi.EmitterPtr, place: mi.Point3f, ball: Ball, far: mi.Bool
+    ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float]:
+        """The rays of a light, at `place`, that meet a ball: `(start, axis, 1 / measure)`."""
+        axis, _, density = cone(ball, place)
+        if self.sources.around is None:
+            return place, axis, density
+        ω = shone(light, far)
+        y = dr.select(far, self.sources.start_of(ball[0], ω), place)
+        return y, dr.select(far, ω, axis), dr.select(far, beam_density(ball), density)
 
     def measure(self, line: LightLine, p: mi.Point2f) -> mi.Float:
-        """Solid angle of a cell, times the share of its cone in what others overlap; 0 off the cone."""
+        """Solid angle or area of a cell, times the share of its cone in what others overlap; 0 off the cone."""
         ω, total = line.direction(p), mi.Float(0)
         off = p - CELLS / 2
         for ball in self._targets:
-            axis, cos_max, inverse = cone(ball, line.y)
-            total += dr.select(dr.dot(axis, ω) >= cos_max, inverse, 0)
-        share = dr.minimum(line.inverse_angle / total, 1)
+            axis, cap, density = cone(ball, line.y)
+            meets = in_cone(axis, cap, ω)
+            if self.sources.around is not None:
+                meets = dr.select(line.far, in_beam(ball, line.origin(p), ω), meets)
+                density = dr.select(line.far, beam_density(ball), density)
+            total += dr.select(meets, density, 0)
+        share = dr.minimum(line.density / total, 1)
         inside = (dr.squared_norm(off) <= CELLS**2 / 4) & (total > 0)
         return dr.select(inside, dr.square(line.cell) * share, 0)
 
     def ray(self, line: LightLine, s: mi.Float) -> mi.Ray3f:
-        return mi.Ray3f(line.y, line.direction(line.at(s)))
+        p = line.at(s)
+        return mi.Ray3f(line.origin(p), line.direction(p))
 
     @property
     def least_width(self) -> mi.Float:

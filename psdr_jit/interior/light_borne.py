@@ -140,10 +140,7 @@ def _leave(found: LightBorne, moves: Displacements) -> tuple[mi.Point3f, mi.Vect
     active = found.records.count > 0
     hit, _ = found.records.vertex(mi.UInt32(0), active)
     emitter = dr.reinterpret_array(mi.EmitterPtr, found.start.emitter)
-    source = dr.zeros(mi.SurfaceInteraction3f)
-    source.p = hit.o + hit.d * hit.t
-    moved, _ = moves.of_light(emitter, source, active)
-    o = mi.Point3f(found.start.y + moved)
+    o = mi.Point3f(found.start.y + moves.of_light_start(emitter, hit, active))
     lit, d, measure = material_segment(o, hit, found.wavelengths, moves, active)
     projected = measure * dr.relative_grad(dr.squared_norm(lit.p - o))  # cosθ_1 |dA_1|
     if found.job.facts.camera_moves:

@@ -1,22 +1,25 @@
 """Where light subpaths start: on a light, aimed at surfaces that may focus it.
 
 A light is chosen, a point y_0 on it (uniform by area; a point light has one), and a direction ω towards the ball around
-one of the targets, uniform in the cone that the ball is seen in. What another way of finding the same segment y_0 → y_1
+one of the targets, uniform in the cone that the ball is seen in. Rays of a directional light start in front of the
+scene, uniform over the disk across them that hides the ball. What another way of finding the same segment y_0 → y_1
 needs to know of this is one number, the density with the segment's own measure taken out,
 
     E = P p_A(y_0) p(ω) / |cosθ_0|          area light; per m² sr, and per unit of cosine
     E = P p(ω) / r²                         point and spot light
+    E = P p_⊥(y_0)                          directional light
 
-P the probability of the light, p(ω) = Σ_i [ω in cone i] / (n Ω_i) over the n targets, θ_0 between ω and the light's
-normal, r the distance. In this measure what the segment carries is L_e / E (for a delta light: its irradiance at y_1,
-perpendicular to the segment, over E), as the weight is that Mitsuba's `sample_ray` returns. `light_technique.py` has
-the rest.
+P the probability of the light, p(ω) = Σ_i [ω in cone i] / (n Ω_i) over the n targets, p_⊥(y_0) = Σ_i [the ray from y_0
+meets ball i] / (n π R_i²), θ_0 between ω and the light's normal, r the distance. In this measure what the segment
+carries is L_e / E (for a delta light: its irradiance at y_1, perpendicular to the segment, over E), as the weight is
+that Mitsuba's `sample_ray` returns. `light_technique.py` has the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -39,6 +42,10 @@ class LightStart:
     radiance: mi.Spectrum  # of an area light along the ray; 0 for a delta light
 
 
+#: A ball: centre and radius.
+Ball: TypeAlias = "tuple[mi.Point3f, mi.Float]"
+
+
 @dataclass(frozen=True)
 class LightSources:
     """Host object: lights that are traced, and what they are aimed at."""
@@ -47,7 +54,8 @@ class LightSources:
     shapes: mi.UInt32  # and of their shapes, 0: none
     density: mi.Float  # by registry index: P p_A(y_0) of an area light, P of a delta light; 0: not traced
     choice: mi.Float  # by registry index: probability with which next-event estimation chooses the light
-    targets: tuple[tuple[mi.Point3f, mi.Float], ...]  # centres and radii of balls
+    targets: tuple[Ball, ...]
+    around: Ball | None = None  # the scene, if rays from far away are among what is traced
 
     def sample(self, sampler, wavelengths) -> LightStart:
         """One light subpath for each lane of `sampler`."""
@@ -64,6 +72,10 @@ class LightSources:
         si.n = dr.select(delta, 0, si.n)
         si.wavelengths = wavelengths
         ω = self._aim(si.p, u_target, v)
+        if self.around is not None:
+            far = is_far(emitter)
+            si.p = dr.select(far, self._from_afar(emitter, u_target, v, far), si.p)
+            ω = dr.select(far, shone(emitter, far), ω)
         si.wi = si.to_local(ω)
         radiance = emitter.eval(si, ~delta)
         ray = si.spawn_ray(ω)
@@ -76,8 +88,8 @@ class LightSources:
         scaled = u * n
         ω = mi.Vector3f(0, 0, 1)
         for i, ball in enumerate(self.targets):
-            axis, cos_max, _ = cone(ball, y)
-            of_ball = mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(v, cos_max))
+            axis, cap, _ = cone(ball, y)
+            of_ball = mi.Frame3f(axis).to_world(_square_to_cone(v, cap))
             ω = dr.select((scaled >= i) | (i == 0), of_ball, ω)
         return ω
 
@@ -85,8 +97,29 @@ class LightSources:
         """Density p(ω) per solid angle of `_aim`."""
         pdf = mi.Float(0)
         for ball in self.targets:
-            axis, cos_max, inverse_angle = cone(ball, y)
-            pdf += dr.select(dr.dot(axis, ω) >= cos_max, inverse_angle, 0)
+            axis, cap, inverse_angle = cone(ball, y)
+            pdf += dr.select(in_cone(axis, cap, ω), inverse_angle, 0)
+        return pdf / len(self.targets)
+
+    def _from_afar(self, emitter: mi.EmitterPtr, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point3f:
+        """The start of a ray of a directional light that meets one of the targets' balls."""
+        n, ω = len(self.targets), shone(emitter, active)
+        disk, scaled = mi.warp.square_to_uniform_disk_concentric(v), u * n
+        across, x = mi.Frame3f(ω).to_world(mi.Vector3f(disk.x, disk.y, 0)), mi.Point3f(0)
+        for i, (centre, radius) in enumerate(self.targets):
+            x = dr.select((scaled >= i) | (i == 0), centre + radius * across, x)
+        return self.start_of(x, ω)
+
+    def start_of(self, x: mi.Point3f, ω: mi.Vector3f) -> mi.Point3f:
+        """Where the ray along ω through `x` starts, in front of the scene."""
+        centre, radius = self.around
+        return x - ω * (dr.dot(x - centre, ω) + radius)
+
+    def _beams_pdf(self, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
+        """Density p_⊥ per area across ω of rays through `x`."""
+        pdf = mi.Float(0)
+        for ball in self.targets:
+            pdf += dr.select(in_beam(ball, x, ω), beam_density(ball), 0)
         return pdf / len(self.targets)
 
     def segment_density(
@@ -103,6 +136,9 @@ class LightSources:
         ω = mi.Vector3f(offset / r)
         measure = dr.select(dr.all(n == 0), dr.rcp(dr.square(r)), dr.rcp(dr.abs_dot(n, ω)))
         E = light * self._aimed_pdf(y, ω) * measure
+        if self.around is not None:
+            far = known & is_far(dr.reinterpret_array(mi.EmitterPtr, dr.select(known, emitter, 0)))
+            E = dr.select(far, light * self._beams_pdf(x, ω), E)
         return dr.select(known & (light > 0) & dr.isfinite(E), E, 0)
 
 
@@ -112,17 +148,55 @@ def place_of(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Point3f:
     return mi.Point3f(dr.detach(ds.p))
 
 
-def cone(ball: tuple[mi.Point3f, mi.Float], y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
-    """The cone in which `y` sees a ball: `(unit axis, cosine of its half angle, 1/Ω)`; all directions from inside."""
+def is_far(emitter: mi.EmitterPtr) -> mi.Bool:
+    """Do rays of the light come from infinitely far away?"""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+
+
+def shone(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Vector3f:
+    """The direction in which a directional light shines. Detached."""
+    ds, _ = emitter.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), active)
+    return dr.select(active, -mi.Vector3f(dr.detach(ds.d)), mi.Vector3f(0, 0, 1))
+
+
+def in_beam(ball: Ball, x: mi.Point3f, ω: mi.Vector3f) -> mi.Bool:
+    """Does the line along ω through `x` meet the ball?"""
+    centre, radius = ball
+    off = x - centre
+    return dr.squared_norm(off - ω * dr.dot(off, ω)) <= dr.square(radius)
+
+
+def beam_density(ball: Ball) -> mi.Float:
+    """1 / area of the disk that a ball hides of parallel rays."""
+    return dr.inv_pi / dr.square(ball[1])
+
+
+def cone(ball: Ball, y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """The cone in which `y` sees a ball: `(unit axis, 1 − cosine of its half angle, 1/Ω)`; from inside, all directions.
+
+    Seen from a thousand radii away, the cosine itself is 1 but for rounding.
+    """
     centre, radius = ball
     to_centre = centre - y
     dist2 = dr.squared_norm(to_centre)
     sin2 = dr.square(radius) / dist2
     outside = sin2 < 1
-    cos_max = dr.select(outside, dr.safe_sqrt(1 - sin2), -1)
-    cap = dr.select(outside, sin2 / (1 + cos_max), 2)  # 1 − cos, without cancellation
+    cap = dr.select(outside, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2)
     axis = dr.select(dist2 > 0, to_centre * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
-    return axis, cos_max, dr.inv_two_pi / cap
+    return axis, cap, dr.inv_two_pi / cap
+
+
+def in_cone(axis: mi.Vector3f, cap: mi.Float, ω: mi.Vector3f) -> mi.Bool:
+    """Is the angle between two unit vectors at most that with the cosine 1 − `cap`?"""
+    return dr.squared_norm(ω - axis) <= 2 * cap
+
+
+def _square_to_cone(u: mi.Point2f, cap: mi.Float) -> mi.Vector3f:
+    """`mi.warp.square_to_uniform_cone`, which takes the cosine, for cones however narrow."""
+    p = mi.warp.square_to_uniform_disk_concentric(u)
+    down = cap * dr.squared_norm(p)
+    p *= dr.safe_sqrt(cap * (2 - down))
+    return mi.Vector3f(p.x, p.y, 1 - down)
 
 
 def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int], most: int) -> LightSources:
@@ -150,7 +224,11 @@ def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int]
     stored = tuple((varying(mi.Point3f, list(c)), varying(mi.Float, MARGIN * float(r))) for c, r in balls)
     tables = mi.UInt32([ids[k] for k in lights]), mi.UInt32(owners), mi.Float(density), mi.Float(choice)
     dr.make_opaque(*tables)
-    return LightSources(*tables, stored)
+    around = None
+    if any(mi.has_flag(emitters[k].flags(), mi.EmitterFlags.Infinite) for k in lights):
+        sphere = scene.bbox().bounding_sphere()
+        around = varying(mi.Point3f, list(sphere.center)), varying(mi.Float, MARGIN * float(sphere.radius))
+    return LightSources(*tables, stored, around)
 
 
 def _ball(shape: mi.Shape) -> tuple[mi.ScalarPoint3f, float]:

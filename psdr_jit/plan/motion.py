@@ -48,6 +48,18 @@ class Displacements(ABC):
     ) -> tuple[mi.Vector3f, mi.Vector3f]:
         """Of a delta light as seen from `it`: `(of its position, of the direction towards it)`."""
 
+    def of_light_start(self, emitter: mi.EmitterPtr, hit: Hit, active: mi.Bool) -> mi.Vector3f:
+        """Of the start of the segment `hit` from a delta light, of which the end keeps its place on its surface.
+
+        Of a directional light, whose ray is any along its direction d, x + t d that which meets it: ẋ = v − t ḋ.
+        """
+        r = dr.select(hit.shape != 0, hit.t, 1)
+        it = dr.zeros(mi.Interaction3f)
+        it.p = hit.o + hit.d * r
+        of_place, towards = self.of_light(emitter, it, active)
+        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        return dr.select(far, self.of_surface(hit) + r * towards, of_place)
+
     @abstractmethod
     def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:
         """The material point at the end of `hit`, attached to its motion."""
