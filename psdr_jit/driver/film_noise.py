@@ -35,22 +35,24 @@ class FilmNoise:
 
     variance: np.ndarray  # (H, W), of one sample
     samples: float  # per pixel: how many have told
+    effort: np.ndarray | None = None  # (H, W), what a sample costs in any unit; None: the same everywhere
 
     @staticmethod
-    def of(images: Mapping[int, np.ndarray], count: int) -> FilmNoise:
+    def of(images: Mapping[int, np.ndarray], count: int, effort: np.ndarray | None = None) -> FilmNoise:
         """From variances (H, W) between `count` images, by their samples per pixel."""
         noise = [FilmNoise(spp * variance, (count - 1) * spp) for spp, variance in images.items()]
         total = sum(n.samples for n in noise)
-        return FilmNoise(sum(n.variance * (n.samples / total) for n in noise), total)
+        return FilmNoise(sum(n.variance * (n.samples / total) for n in noise), total, effort)
 
     @cached_property
     def density(self) -> FilmDensity | None:
         """Where samples are wanted; None: nowhere in particular."""
-        return FilmDensity.of(self.variance)
+        return FilmDensity.of(self.variance, self.effort)
 
     def seen(self, variance: np.ndarray, spp: int, calls: int) -> FilmNoise:
         """With the mean variance (H, W) of `calls` images of `spp` samples per pixel, drawn by this density."""
         there = self.density.expected if self.density is not None else 1.0
         before = min(self.samples, calls * spp * (1 / FORGET - 1))
         new = calls * spp / (before + calls * spp)
-        return FilmNoise((1 - new) * self.variance + new * spp * there * variance, before + calls * spp)
+        seen = (1 - new) * self.variance + new * spp * there * variance
+        return FilmNoise(seen, before + calls * spp, self.effort)

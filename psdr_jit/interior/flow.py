@@ -31,7 +31,7 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
-from ..paths.recording import GRAZING
+from ..paths.recording import GRAZING, PathRecords
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
 
@@ -55,10 +55,15 @@ class SceneTraits:
     smooth_lights: bool  # smooth-shaded area lights, see `next_event`
     tubes: Tubes | None = None  # curves
     followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
+    lights_rest: bool = False  # area lights stay where they are, and as large
 
 
 class Flow(ABC):
     """Host object of a job: the terms of a vertex as a function of how it is reached."""
+
+    def vertices(self, records: PathRecords) -> mi.UInt32:
+        """How many vertices of every path have terms: one less if those of the last are certainly 0."""
+        return records.count
 
     @abstractmethod
     def terms(
@@ -76,26 +81,43 @@ def material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements,
     `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
     direction stays as it is.
     """
-    ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
-    si = moves.material(hit, ray, active)
+    si = _material(x, hit, wavelengths, moves, active)
+    ω, measure = _towards(x, hit, si, _area_element(si, active & si.is_valid()), active)
+    return si, ω, measure
+
+
+def _material(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool):
+    """The material point `hit`, which a ray from `x` meets."""
+    return moves.material(hit, mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths), active)
+
+
+def _towards(x: mi.Point3f, hit: Hit, si, area: mi.Float, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
+    """`(ω, measure)` of `material_segment` to the material point `si`."""
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
     ω = mi.Vector3f(hit.d)
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
-    area = _area_element(si, on_surface)
     cos = dr.abs_dot(si.n, ω)
     # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
     usable = on_surface & (cos > GRAZING) & (area > 0)
     measure = dr.select(usable, cos / dist2 * area, 1)
-    return si, ω, dr.relative_grad(measure)
+    return ω, dr.relative_grad(measure)
 
 
 def emission_towards(
-    x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, moves: Displacements, active: mi.Bool
+    x: mi.Point3f, hit: Hit, wavelengths, emitter: mi.EmitterPtr, moves: Displacements, active: mi.Bool, rests: bool
 ):
-    """Emission of the material point `hit` towards the attached point `x`: `(point, ω, L_e · measure)`, attached."""
-    si, ω, measure = material_segment(x, hit, wavelengths, moves, active)
+    """Emission of the material point `hit` towards the attached point `x`: `(point, ω, L_e · measure)`, attached.
+
+    `rests`: `SceneTraits.lights_rest`, which spares the way back to vertices of lights.
+    """
+    if not rests:
+        si, ω, measure = material_segment(x, hit, wavelengths, moves, active)
+        return si, ω, emitter.eval(si, active) * measure
+    with dr.suspend_grad():
+        si = _material(x, hit, wavelengths, moves, active)
+    ω, measure = _towards(x, hit, si, mi.Float(1), active)
     return si, ω, emitter.eval(si, active) * measure
 
 
@@ -127,7 +149,7 @@ def next_event(
     if traits.followed is not None:
         along = active & traits.followed.has(emitter, active)
         resting = active & ~along
-    light, ω, value = emission_towards(si.p, hit, si.wavelengths, emitter, moves, resting)
+    light, ω, value = emission_towards(si.p, hit, si.wavelengths, emitter, moves, resting, traits.lights_rest)
     if traits.smooth_lights:
         n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
         usable = resting & light.is_valid() & (n_g > GRAZING) & (n_s > GRAZING)

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
+from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, emitter_behind, material_segment, next_event
 
@@ -25,6 +26,9 @@ class MaterialFlow(Flow):
 
     scene: mi.Scene
     traits: SceneTraits
+
+    def vertices(self, records: PathRecords) -> mi.UInt32:
+        return records.scattering()  # what others than the first emit is among the terms of those before them
 
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements

@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
 from ..paths.delta_step import delta_step
+from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event
 
@@ -32,6 +33,9 @@ class SpatialFlow(Flow):
 
     scene: mi.Scene
     traits: SceneTraits
+
+    def vertices(self, records: PathRecords) -> mi.UInt32:
+        return records.scattering()  # what others than the first emit is among the terms of those before them
 
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
@@ -47,7 +51,8 @@ class SpatialFlow(Flow):
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
         along = mi.Bool(False) if self.traits.followed is None else self.traits.followed.has(emitter, emits)
-        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along)
+        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along,
+                                       self.traits.lights_rest)  # fmt: skip
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
         onward = following.hit.d
         if self.traits.delta_lobes:

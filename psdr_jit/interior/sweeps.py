@@ -29,7 +29,7 @@ def backward_sweep(records: PathRecords, δL: mi.Spectrum, flow: Flow, motion: M
 
     `δL`: adjoint of each path's radiance, detached.
     """
-    k = mi.UInt32(records.count)
+    k = mi.UInt32(flow.vertices(records))
     rest = mi.Spectrum(0)  # radiance that the next vertex sends back, without its own emission
     λ_o = mi.Vector3f(0)
     λ_d = mi.Vector3f(0)
@@ -58,7 +58,8 @@ def forward_sweep(records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f
     β_grad = mi.Spectrum(0)
     o_grad = mi.Vector3f(o_grad)
     d_grad = mi.Vector3f(d_grad)
-    active = k < records.count
+    count = flow.vertices(records)
+    active = k < count
     while dr.hint(active, label="psdr.interior.forward", exclude=[flow, motion]):
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & v.onward.goes_on())
@@ -74,5 +75,5 @@ def forward_sweep(records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f
         o_grad = mi.Vector3f(x_grad)
         d_grad = mi.Vector3f(onward_grad)
         k += 1
-        active = k < records.count
+        active = k < count
     return dL

@@ -94,8 +94,12 @@ def every_path_differs(job: Job) -> bool:
     """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
     facts = job.facts
     emission = any(e.pose or e.radiance for e in facts.emitters)
-    moving_lights = any(s.is_emitter and (s.geometry or s.shading) for s in facts.shapes)
-    return facts.camera_moves or emission or moving_lights or not job.plan.prunes
+    return facts.camera_moves or emission or _area_lights_change(facts) or not job.plan.prunes
+
+
+def _area_lights_change(facts: SceneFacts) -> bool:
+    """May points of area lights move, or their normals turn?"""
+    return any(s.is_emitter and (s.geometry or s.shading) for s in facts.shapes)
 
 
 def touch_table(job: Job) -> mi.UInt32:
@@ -170,8 +174,10 @@ def flow_of(job: Job) -> Flow:
     """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
     smooth_lights = any(s.is_emitter and s.smooth for s in facts.shapes)
+    # a probe moves everything
+    lights_rest = job.plan.prunes and job.learns and not (facts.emitters_move or _area_lights_change(facts))
     traits = SceneTraits(
-        facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes, followed_lights(job)
+        facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes, followed_lights(job), lights_rest
     )
     if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows
         return RestingFlow(job.scene, traits)

@@ -55,6 +55,15 @@ class PathRecords(Sink):
         self.count = dr.minimum(self.count, self.whole)
         return short
 
+    def scattering(self) -> mi.UInt32:
+        """Number of vertices per lane without a last one that sends nothing back, but for what it emits."""
+        last, ends = self.count - 1, self.count > 1
+        index = last * self.stride + self.lane
+        v = self.vertices
+        lit = dr.gather(mi.UInt32, v.nee.emitter, index, ends) != 0
+        goes_on = dr.gather(mi.Float, v.onward.pdf, index, ends) > 0
+        return dr.select(ends & ~lit & ~goes_on, last, self.count)
+
     def vertex(self, k: mi.UInt32, active: mi.Bool) -> Vertex:
         """Vertex `k` of every lane; zero where inactive."""
         return dr.gather(Vertex, self.vertices, k * self.stride + self.lane, active)

@@ -18,6 +18,9 @@ from psdr_jit.interior.flow import Flow, VertexTerms
 from psdr_jit.interior.sweeps import backward_sweep, forward_sweep
 from psdr_jit.paths.recording import PathRecords
 from psdr_jit.plan.motion import SceneMotion
+from psdr_jit.scene import io as scene_io
+
+ONLY_INTERIOR = {"sppp": 0, "spps": 0, "sppd": 0, "sppi": 0}
 
 LANES, DEPTH = 4, 3
 STEP = 2.0  # distance of the planes [m]
@@ -152,3 +155,34 @@ def test_backward_is_the_transpose(variant, turns):
     scale = np.linalg.norm(np.array(δL)) * np.linalg.norm(dL)
     assert abs(there - sum(parts)) < 1e-5 * scale, (there, parts)
     assert all(abs(part) > 1e-3 * scale for part in parts), "a part that is 0 shows nothing"
+
+# ------------------------------------------------------------------------------------------ what is left out
+
+
+def test_a_last_vertex_that_sends_nothing_back_is_not_asked(llvm):
+    """By lane: nothing at its end, an emitter sample there, a path that goes on, and one vertex alone, which emits."""
+    records = PathRecords(4, 2)
+    v = Vertex.made(dr.zeros, 8)
+    v.nee.emitter = mi.UInt32([0, 0, 0, 0, 0, 7, 0, 0])  # vertex-major
+    v.onward.pdf = mi.Float([1, 1, 1, 0, 0, 0, 0.5, 0])
+    records.vertices, records.count = v, mi.UInt32([2, 2, 2, 1])
+    assert records.scattering().numpy().tolist() == [1, 2, 2, 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["spatial", "material"])
+def test_lights_that_rest_need_no_derivative(llvm, form):
+    """The plan knows that the lamp stays; the full plan does not, and finds the same gradient."""
+    scene = scene_io.load_scene(scene_io.shipped_scene("cbox.xml"), res=8)
+    params, key, found = mi.traverse(scene), "small-box.vertex_positions", {}
+    grad_in = mi.TensorXf(np.linspace(-1, 1, 8 * 8 * 3).astype(np.float32).reshape(8, 8, 3))
+    for plan in ("lean", "full"):
+        integrator = mi.load_dict({"type": "psdr_path", "max_depth": 4, "plan": plan, "form": form, **ONLY_INTERIOR})
+        params[key] = mi.Float(dr.detach(params[key]))
+        dr.enable_grad(params[key])
+        params.set_dirty(key)
+        params.update()
+        integrator.render_backward(scene, params, grad_in, seed=3, spp=16)
+        found[plan] = np.array(dr.grad(params[key]), np.float64)
+    largest = np.abs(found["full"]).max()
+    assert largest > 0 and np.abs(found["lean"] - found["full"]).max() < 2e-5 * largest
