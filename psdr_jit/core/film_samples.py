@@ -38,7 +38,7 @@ class FilmDensity:
     @staticmethod
     def of(variance: np.ndarray) -> FilmDensity | None:
         """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise."""
-        spread = np.sqrt(_smoothed(np.asarray(variance, np.float64)))
+        spread = np.sqrt(smoothed(np.asarray(variance, np.float64)))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
         return FilmDensity(tuple(spread.shape), packed(spread / spread.mean() + LEAST_NOISE))
@@ -76,7 +76,7 @@ class FilmDensity:
         return float(np.mean(variance)) / mean if mean > 0 else 1.0
 
 
-def _smoothed(variance: np.ndarray) -> np.ndarray:
+def smoothed(variance: np.ndarray) -> np.ndarray:
     """Mean over the pixel and its neighbours, as far as there are any."""
     rows, columns = variance.shape
     padded = np.pad(variance, 1, mode="edge")
