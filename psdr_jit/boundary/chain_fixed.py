@@ -5,7 +5,8 @@ The spatial form keeps the directions in which smooth vertices are left, and poi
 is that function whose steps are looked for. So both must be drawn without regard to where on the line a chain begins:
 
     direction     from a mixture of equal parts of what the surface prefers that a chain from a random point of the
-                  line (the *guide*) meets there, and of the whole sphere; where the guide has ended, the sphere alone
+                  line (the *guide*) meets there, and of the whole sphere; half of them aimed from there (`chain_aims`)
+                  if there is something to aim at; where the guide has ended, the sphere alone
     light point   on an emitter by its area, or as a direction to the sky
 
 The share of the sphere bounds the weights of chains that meet another surface than the guide does.
@@ -21,9 +22,13 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..core.varying import varying
 from ..paths.rays import shadow_hit
+from .chain_aims import ChainAims
 
-#: Share of directions that are drawn from the whole sphere.
+#: Share of directions that are drawn from the whole sphere, of those that are not aimed.
 SPHERE_SHARE = 0.5
+
+#: Share of directions that are aimed, where there is something to aim at; the others are drawn as without.
+AIMED_SHARE = 0.5
 
 
 @dataclass
@@ -52,15 +57,25 @@ class Directions:
         return dr.gather(Direction, self.data, k * self.stride + line, active)
 
 
-def draw_direction(si: mi.SurfaceInteraction3f, sampler, smooth: mi.Bool) -> Direction:
+def draw_direction(si: mi.SurfaceInteraction3f, sampler, smooth: mi.Bool, aims: ChainAims | None) -> Direction:
     """Of the guide's vertex `si`, which is left by a `smooth` lobe; elsewhere from the whole sphere."""
     u_share, u_lobe, u = sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
     ω, ctx, bsdf = mi.warp.square_to_uniform_sphere(u), mi.BSDFContext(), si.bsdf()
+    aimed, cones = mi.Bool(False), None
+    if aims is not None:
+        cones = aims.seen_from(si.p)
+        q = dr.select(smooth & (cones.total > 0), AIMED_SHARE, mi.Float(0))
+        aimed = u_share < q
+        u_share = dr.select(aimed, 0, (u_share - q) / (1 - q))
     preferred = smooth & (u_share >= SPHERE_SHARE)
     bs, _ = bsdf.sample(ctx, si, u_lobe, u, preferred)
     wasted = preferred & ((bs.pdf == 0) | mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta))
     ω = dr.select(preferred, si.to_world(bs.wo), ω)
+    if aims is not None:
+        ω = dr.select(aimed, cones.sample(u), ω)
     pdf = SPHERE_SHARE * dr.inv_four_pi + (1 - SPHERE_SHARE) * bsdf.pdf(ctx, si, si.to_local(ω), smooth)
+    if aims is not None:
+        pdf = q * cones.pdf(ω) + (1 - q) * pdf
     return Direction(ω, dr.select(wasted, 0, dr.select(smooth, pdf, dr.inv_four_pi)))
 
 

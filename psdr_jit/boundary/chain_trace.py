@@ -25,6 +25,7 @@ from ..core.varying import varying
 from ..edges.followed_lights import FollowedLights, followed_lights
 from ..plan.job import Job
 from ..plan.probe_motion import registry_table
+from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lobes import has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
@@ -55,6 +56,7 @@ class ChainWorld:
     scatters: bool  # are there such vertices at all?
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
     followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
+    aims: ChainAims | None = None  # what directions from smooth vertices are aimed at
 
     @staticmethod
     def of(job: Job) -> ChainWorld:
@@ -75,6 +77,7 @@ class ChainWorld:
             scatters=facts.scatters,
             mode=mi.TransportMode.Radiance,
             followed=followed_lights(job),
+            aims=ChainAims.of(job),
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
@@ -184,7 +187,7 @@ def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: 
         active &= si.is_valid()
         u = Numbers.draw(rng)
         smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
-        fixed = draw_direction(si, sampler, smooth & active)
+        fixed = draw_direction(si, sampler, smooth & active, world.aims)
         out.write(k, line, fixed)
         onward = leave(si, k, u.lobe, fixed, active, ctx)
         ray, active = onward.ray, onward.alive

@@ -43,7 +43,9 @@ NAME = "indirect"
 def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples:
     """The step of radiance across every edge, at the sensor."""
     turn = edges.table.turn(view.sight.at, view.sight.ω, view.sight.n_perp) - view.sight.r * view.sight.n_perp
-    receivers = Receivers(view.lane, view.receiver, view.wavelengths, view.value / view.pdf, -view.sight.n_perp, turn)
+    waits = edges.rests(view.sight.at.row)
+    value = view.value / view.pdf
+    receivers = Receivers(view.lane, view.receiver, view.wavelengths, value, -view.sight.n_perp, turn, waits)
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
     value = job.call.counters.rejected.keep_finite(records.data.W * _step(job, edges.table, view, records))
     dr.eval(value)

@@ -35,6 +35,7 @@ from ..paths.scattering import UNIFORM_SHARE
 from ..paths.sensor_connection import on_film, seen_by_sensor
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
+from .awaited import Awaited
 from .delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
@@ -51,6 +52,7 @@ class Receivers:
     value: mi.Spectrum  # of the boundary segment over its density
     a: mi.Vector3f  # covector on u_D
     b: mi.Vector3f  # covector on the direction in which x_D is left, which moves if that is by a delta lobe
+    waits: mi.Bool | None = None  # nothing but what moves along the subpath makes it count; None: it counts anyway
 
 
 @dataclass
@@ -234,11 +236,17 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     # Vertex 0 is what the segment comes from. Roulette judges the walk alone, not the segment that it started from.
     path = PathState.start(1)
     active = mi.Bool(True)
-    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits]):
+    awaited = Awaited.of(job, receivers.waits)
+    waits = mi.Bool(awaited is not None) if awaited is None else mi.Bool(receivers.waits)
+    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits, awaited]):
         si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         end = _connect(job, sampler, si, bsdf, value * path.β, active)
-        onward = bounce(si, bsdf, sampler, path, limits, ctx, active)
+        if dr.hint(awaited is not None, mode="scalar"):
+            waits &= ~awaited.met(dr.reinterpret_array(mi.UInt32, pi.shape))
+        onward = bounce(
+            si, bsdf, sampler, path, limits if awaited is None else awaited.aimed(limits, si.p, waits), ctx, active
+        )
         following = onward.ray(si)
         g_connect = deposit(a, si.n, end.view.ω)
         g_continue = _carried_off(job.form, a, si.n, -following.d)

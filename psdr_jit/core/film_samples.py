@@ -42,12 +42,12 @@ class FilmDensity:
 
         `effort`: what a sample of each pixel costs, relative to any unit; None: the same everywhere.
         """
-        spread = np.sqrt(_smoothed(np.asarray(variance, np.float64)))
+        spread = np.sqrt(smoothed(np.asarray(variance, np.float64)))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
         wish = spread / spread.mean() + LEAST_NOISE
         if effort is not None:
-            wish = wish / np.sqrt(_smoothed(effort))
+            wish = wish / np.sqrt(smoothed(effort))
         return FilmDensity(tuple(spread.shape), packed(wish))
 
     @cached_property
@@ -87,7 +87,7 @@ class FilmDensity:
         return float(np.mean(variance)) / mean if mean > 0 else 1.0
 
 
-def _smoothed(variance: np.ndarray) -> np.ndarray:
+def smoothed(variance: np.ndarray) -> np.ndarray:
     """Mean over the pixel and its neighbours, as far as there are any."""
     rows, columns = variance.shape
     padded = np.pad(variance, 1, mode="edge")

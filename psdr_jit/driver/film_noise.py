@@ -6,19 +6,23 @@ the term's own law (`pilot.TermNoise`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ..core.film_samples import FilmDensity
+from ..core.film_samples import FilmDensity, smoothed
 
 #: Rows and columns of what is kept, at most: it travels with the plan.
 MOST_CELLS = 256
 
 #: Least share of what was seen last: the scene changes as an optimisation goes on.
 FORGET = 0.2
+
+#: Of the pixels with noise, the share whose variance is believed; that of the others, the noisiest, counts as as much
+#: as these have, or as `SEEN_TWICE` times what each of two independent estimates has found there.
+BELIEVED, SEEN_TWICE = 0.95, 4.0
 
 
 def coarse(image: np.ndarray) -> np.ndarray:
@@ -42,7 +46,7 @@ class FilmNoise:
         """From variances (H, W) between `count` images, by their samples per pixel."""
         noise = [FilmNoise(spp * variance, (count - 1) * spp) for spp, variance in images.items()]
         total = sum(n.samples for n in noise)
-        return FilmNoise(sum(n.variance * (n.samples / total) for n in noise), total, effort)
+        return FilmNoise(_believed([(n.variance, n.samples / total) for n in noise]), total, effort)
 
     @cached_property
     def density(self) -> FilmDensity | None:
@@ -54,5 +58,18 @@ class FilmNoise:
         there = self.density.expected if self.density is not None else 1.0
         before = min(self.samples, calls * spp * (1 / FORGET - 1))
         new = calls * spp / (before + calls * spp)
-        seen = (1 - new) * self.variance + new * spp * there * variance
+        seen = _believed([(self.variance, 1 - new), (spp * there * variance, new)])
         return FilmNoise(seen, before + calls * spp, self.effort)
+
+
+def _believed(estimates: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """The mean of independent estimates (variance (H, W), weight) but for what only one of them has met.
+
+    A rare contribution is met in few of the pixels that have it: samples sent there are missing elsewhere.
+    """
+    mean = sum(weight * variance for variance, weight in estimates)
+    noisy = mean[mean > 0]
+    if not noisy.size:
+        return mean
+    by_all = np.minimum.reduce([smoothed(variance) for variance, _ in estimates])
+    return np.minimum(mean, np.maximum(np.quantile(noisy, BELIEVED), SEEN_TWICE * by_all))

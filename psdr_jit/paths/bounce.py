@@ -19,7 +19,7 @@ from ..core.records import Continuation
 from ..scene.tubes import Tubes
 from .critical_angle import CriticalAngle
 from .light_technique import LightTechnique
-from .scattering import Mixture, Scattering, accepted, mixture_pdf, sample_scattering
+from .scattering import Aim, Mixture, Scattering, accepted, mixture_pdf, sample_scattering
 
 #: Largest probability with which the roulette lets a path live, as in Mitsuba's `path`.
 MOST_SURVIVAL = 0.95
@@ -38,11 +38,12 @@ class PathLimits:
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
     tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
     light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
+    aim: Aim | None = None  # where the next direction is worth taking
 
     @property
     def mixture(self) -> Mixture:
         """How directions are sampled."""
-        return Mixture(self.uniform_share, self.critical)
+        return Mixture(self.uniform_share, self.critical, self.aim)
 
     def beyond(self, k: mi.UInt32) -> PathLimits:
         """Limits of paths that have `k` segments behind them already, lane by lane."""

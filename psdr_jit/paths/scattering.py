@@ -9,6 +9,7 @@ directions close to total reflection, where an index of refraction is differenti
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +20,32 @@ from .delta_step import FIRST_LOBE, LAST_LOBE
 #: Share of uniform directions where derivatives are estimated along a path.
 UNIFORM_SHARE = 0.25
 
+#: Share of directions that are aimed, where there is an aim.
+AIMED_SHARE = 0.5
+
+
+class Directions(Protocol):
+    """A distribution of directions in world space."""
+
+    @property
+    def total(self) -> mi.Float:
+        """0 where there is none."""
+
+    def sample(self, u: mi.Point2f) -> mi.Vector3f: ...
+
+    def pdf(self, d: mi.Vector3f) -> mi.Float: ...
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Directions that are worth taking from a vertex. Host object."""
+
+    directions: Directions
+    wanted: mi.Bool  # lanes that take a share of them
+
+    def share(self, bsdf: mi.BSDFPtr) -> mi.Float:
+        return _share(bsdf, dr.select(self.wanted & (self.directions.total > 0), AIMED_SHARE, mi.Float(0)))
+
 
 @dataclass(frozen=True)
 class Mixture:
@@ -26,11 +53,12 @@ class Mixture:
 
     uniform: float = 0.0  # share of uniform directions
     critical: CriticalAngle | None = None  # brings its own share of the others
+    aim: Aim | None = None  # the same, before both
 
     @property
     def plain(self) -> bool:
         """Nothing is."""
-        return self.uniform == 0 and self.critical is None
+        return self.uniform == 0 and self.critical is None and self.aim is None
 
 
 #: Sampling as the BSDF has it.
@@ -59,7 +87,11 @@ def mixture_pdf(si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, pdf_bsdf: mi.Float, mixtu
     same_side = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
     uniform = dr.select(through, dr.inv_four_pi, dr.select(same_side, dr.inv_two_pi, 0))
     share = _share(bsdf, mixture.uniform)
-    return share * uniform + (1 - share) * pdf_bsdf
+    pdf = share * uniform + (1 - share) * pdf_bsdf
+    if mixture.aim is not None:
+        aimed = mixture.aim.share(bsdf)
+        pdf = aimed * mixture.aim.directions.pdf(si.to_world(wo)) + (1 - aimed) * pdf
+    return pdf
 
 
 def reverse_pdf(ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, mixture: Mixture, active: mi.Bool) -> mi.Float:
@@ -74,7 +106,7 @@ def reverse_pdf(ctx, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, mixture: Mixture, ac
     return mixture_pdf(turned, bsdf, si.wi, bsdf.pdf(opposite, turned, si.wi, active), mixture)
 
 
-def _share(bsdf: mi.BSDFPtr, share: float) -> mi.Float:
+def _share(bsdf: mi.BSDFPtr, share: float | mi.Float) -> mi.Float:
     """Delta lobes keep pure BSDF sampling: their probability is not a density."""
     return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta), 0, share)
 
@@ -128,8 +160,13 @@ def sample_scattering(
         bs, weight = bsdf.sample(ctx, si, u_lobe, u, active)
         return accepted(ctx, si, bsdf, bs, weight, refuses, active)
     share = mixture.uniform
+    aimed = mi.Bool(False)
+    if mixture.aim is not None:
+        of_aim = mixture.aim.share(bsdf)
+        aimed = u_lobe < of_aim
+        u_lobe = dr.select(aimed, u_lobe / of_aim, (u_lobe - of_aim) / (1 - of_aim))
     q = _share(bsdf, share)
-    uniform = u_lobe < q
+    uniform = ~aimed & (u_lobe < q)
     two_lobes = _two_delta_lobes(bsdf)
     evenly = two_lobes & (u_lobe < share)
     skipped = dr.select(two_lobes, share, q)
@@ -137,11 +174,11 @@ def sample_scattering(
     critical = mi.Bool(False)
     if mixture.critical is not None:
         near = mixture.critical.share(bsdf, si.wi)
-        critical = ~uniform & (u_lobe < near)
+        critical = ~aimed & ~uniform & (u_lobe < near)
         u_lobe = dr.select(uniform, u_lobe, (u_lobe - near) / (1 - near))
     u_lobe = dr.select(evenly, dr.select(u_lobe < 0.5, FIRST_LOBE, LAST_LOBE), u_lobe)
-    bs, weight = bsdf.sample(ctx, si, u_lobe, u, active & ~uniform & ~critical)
-    delta = ~uniform & ~critical & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    bs, weight = bsdf.sample(ctx, si, u_lobe, u, active & ~aimed & ~uniform & ~critical)
+    delta = ~aimed & ~uniform & ~critical & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
 
     hemisphere = mi.warp.square_to_uniform_hemisphere(u)
     through = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
@@ -150,17 +187,19 @@ def sample_scattering(
     wo = dr.select(uniform, hemisphere, bs.wo)
     if mixture.critical is not None:
         wo = dr.select(critical, mixture.critical.sample(bsdf, si.wi, u), wo)
+    if mixture.aim is not None:
+        wo = dr.select(aimed, si.to_local(mixture.aim.directions.sample(u)), wo)
 
     f, pdf_bsdf = bsdf.eval_pdf(ctx, si, wo, active & ~delta)
     pdf = mixture_pdf(si, bsdf, wo, pdf_bsdf, mixture)
     reflected = mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(si.wi) > 0
-    found = uniform | (critical & reflected) | (~critical & (bs.pdf > 0) & ~_refused(weight, f))
+    found = aimed | uniform | (critical & reflected) | (~critical & (bs.pdf > 0) & ~_refused(weight, f))
     found &= pdf > 0
     if mixture.critical is not None:
         found &= ~mixture.critical.blurred(bsdf, si.wi, wo)
     chosen = delta_probability(bsdf, bs.pdf, mixture)
     of_delta = dr.select(chosen > 0, weight * (bs.pdf / chosen), 0)
     weight = dr.select(delta, of_delta, dr.select(found, f / pdf, 0))
-    η = dr.select(uniform | critical, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette
+    η = dr.select(aimed | uniform | critical, 1, bs.eta)  # of uniform directions unknown; it only steers the roulette
     pdf = dr.select(delta, chosen, dr.select(found, pdf, 0))
     return Scattering(wo, pdf, weight, η, delta)

@@ -22,7 +22,8 @@ from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable
 from ..edges.wedges import Wedges
 from ..plan.job import Job
-from .directions import Cone, pdf_view, sample_view, towards_sphere
+from .directions import Cones, pdf_view, sample_view
+from .mirror_images import SeenBall, SeenBalls, with_images
 from .rows import ROW_SAMPLER, SampledRows, row_state
 
 #: Share of the samples on edges of resting shapes while only shapes move.
@@ -40,13 +41,17 @@ MAX_EMITTERS = 16
 
 @dataclass(frozen=True)
 class Movers:
-    """Ball around everything that can move, if only shapes do."""
+    """Ball around everything that can move, if only shapes do, and its images in mirrors."""
 
-    centre: mi.Point3f
-    radius: mi.Float
+    seen: SeenBalls
 
-    def seen_from(self, x: mi.Point3f) -> Cone:
-        return towards_sphere(x, self.centre, self.radius)
+    @property
+    def in_mirrors(self) -> bool:
+        """Does a mirror show it?"""
+        return len(self.seen.balls) > 1
+
+    def seen_from(self, x: mi.Point3f) -> Cones:
+        return self.seen.seen_from(x)
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,9 @@ class SecondaryEdges(SampledRows):
     use: Use
     movers: Movers | None
     resting: mi.Bool  # by row of the table: matters only through what slides; unused without movers
+
+    def rests(self, row: mi.UInt32) -> mi.Bool | None:
+        return None if self.movers is None else dr.gather(mi.Bool, self.resting, row)
 
     def views(self, row: mi.UInt32) -> RowViews:
         """Directions through points of these rows of the table."""
@@ -88,7 +96,7 @@ class RowViews(Views):
 
 def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
     """The edges that `term` samples, for lines anywhere in the scene; None if nothing can contribute."""
-    table, movers = scene_edges(job), _movers(job, use)
+    table, movers = scene_edges(job), movers_of(job, use)
     rows = job.call.memory[ROW_SAMPLER]
     state = row_state(job, f"{term}/{use.value}", lambda: line_weights(job, use))
     if state is None:
@@ -102,7 +110,7 @@ def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
 
 def line_weights(job: Job, use: Use) -> list[mi.Float]:
     """By kind of edge, the relative weight of each row for lines anywhere in the scene."""
-    table, movers = scene_edges(job), _movers(job, use)
+    table, movers = scene_edges(job), movers_of(job, use)
     weights = table.weights(lambda kind: kind.line_weights(use))
     lights = light_bounds(job) if use is Use.SHADOW else None
     if lights is not None:
@@ -114,8 +122,11 @@ def line_weights(job: Job, use: Use) -> list[mi.Float]:
     return _balanced(weights, table.moving(), seen)
 
 
-def _movers(job: Job, use: Use) -> Movers | None:
-    """None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves."""
+def movers_of(job: Job, use: Use) -> Movers | None:
+    """What moves, if only some shapes do.
+
+    None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves.
+    """
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]
@@ -123,11 +134,8 @@ def _movers(job: Job, use: Use) -> Movers | None:
     if everywhere or not moving or not job.plan.prunes:
         return None
     shapes = job.scene.shapes()
-    box = mi.ScalarBoundingBox3f()
-    for s in moving:
-        box.expand(shapes[s.index].bbox())
-    sphere = box.bounding_sphere()
-    return Movers(varying(mi.Point3f, list(sphere.center)), varying(mi.Float, float(sphere.radius)))
+    ball = [SeenBall.around(shapes[s.index] for s in moving)]
+    return Movers(SeenBalls.of(ball if use is Use.SHADOW else with_images(job, ball)))
 
 
 def _balanced(weights: list, moving: list, seen: list) -> list:

@@ -100,6 +100,10 @@ class SampledRows:
         """`(row, t, pdf)` of `count` stratified samples, pdf times their number."""
         return self.rows_at(stratified(count, jitter), count)
 
+    def rests(self, row: mi.UInt32) -> mi.Bool | None:
+        """Do these rows matter only through what slides? None: all of them matter by themselves."""
+        return None
+
     def rows_at(self, x: mi.Float64, count: int) -> tuple[mi.UInt32, mi.Float, mi.Float]:
         """The same for given numbers in [0, 1)."""
         row, t = self.rows.sample(self.state, x)

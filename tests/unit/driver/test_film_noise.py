@@ -22,6 +22,18 @@ def test_images_of_more_samples_tell_more():
     assert np.allclose(noise.variance, (2 * 8 + 8 * 4) / 10) and noise.samples == 10
 
 
+def test_one_pixel_does_not_take_what_others_need():
+    """A rare contribution that one half of the pilot has met; where both have, there is noise indeed."""
+    outline = np.zeros((32, 32))
+    outline[4:14, 4:14] = 1.0
+    met = outline.copy()
+    met[25, 25] = 1e6
+    for few, more, believed in ((outline, met, False), (met, met, True)):
+        density = FilmNoise.of({1: few, 4: more / 4}, 3).density.relative
+        assert (density[25, 25] > 10 * density[8, 8]) == believed
+        assert (density[8, 8] > 3) != believed
+
+
 def test_what_is_seen_with_a_density_is_put_back_to_one_sample():
     """The same variances of single samples again: nothing is learned but how sure they are."""
     truth = np.arange(1.0, 25.0).reshape(SHAPE) ** 2
