@@ -31,7 +31,7 @@ OURS = (DEFAULT_INTEGRATOR, "psdr_bdpt")
 # Mitsuba's own, for comparisons: term name, its sample budget
 PROJECTIVE_TERMS = (("interior", "sppc"), ("primary", "sppp"), ("secondary", "sppi"))
 
-UNKNOWN = "failed to instantiate unknown plugin"  # how Mitsuba begins to say so
+UNKNOWN = 'Plugin "{}" not found'  # how Mitsuba says so
 INSIDE = 4  # channels that Mitsuba's `aov` lists for the integrator in it: R, G, B, A
 
 # what the reference has to share with the integrator under test
@@ -102,7 +102,7 @@ def build(spec: Mapping[str, Any]) -> Any:
     try:
         return mi.load_dict(given)
     except RuntimeError as error:
-        if UNKNOWN in str(error):
+        if UNKNOWN.format(spec.get("type")) in str(error):
             raise OptionError(f"there is no integrator '{spec.get('type')}': ours are {' and '.join(OURS)}, "
                               "Mitsuba has others, such as prb") from error  # fmt: skip
         raise OptionError(f"integrator '{spec.get('type')}' cannot be made: {_last_line(error)}") from error
