@@ -54,10 +54,6 @@ from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
 
 NAME = "chain"
 
-#: Time of finding a crossing, by some twenty comparisons, and of following it, in that of a line which finds none
-#: (a mirror and a glass ball in a Cornell box, 64², evenly spread lines and others, two cores).
-FIND_COST = 8.0
-
 #: Memory of one line: an interval, its comparison, its share of what is found, and its directions.
 BYTES = 256 + CHAIN_DEPTH * Directions.BYTES
 
@@ -155,8 +151,6 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     end = End(pair.last, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
-    if job.finds is not None:
-        job.finds.add(p)
     valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
     per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
@@ -253,5 +247,4 @@ TERM = Term(
     forward=forward,
     backward=backward,
     over_film=True,
-    per_find=FIND_COST,
 )

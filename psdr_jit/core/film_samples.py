@@ -1,10 +1,9 @@
 """How many samples each pixel of the film gets: the same number everywhere, or more where a term is noisy.
 
 In every pixel samples are uniform, and their numbers are settled before any of them is drawn: with 1/n_i on each of
-n_i samples a pixel's mean is unbiased for any n_i ≥ 1. At a given cost the variance Σ v_i/n_i of an image is least for
-n_i ∝ √(v_i/c_i), where v_i is that of one sample and c_i what it costs. Both are known from a few samples only
-(`driver/pilot.py`), so a share of the samples goes evenly to all pixels: what the pilot has missed costs at most
-1/`EVEN_SHARE` times the variance it has anyway.
+n_i samples a pixel's mean is unbiased for any n_i ≥ 1. The variance Σ v_i/n_i of an image is least for n_i ∝ √v_i,
+where v_i is that of one sample. It is known from a few samples only (`driver/pilot.py`), so a share of the samples
+goes evenly to all pixels: what the pilot has missed costs at most 1/`EVEN_SHARE` times the variance it has anyway.
 """
 
 from __future__ import annotations
@@ -37,18 +36,12 @@ class FilmDensity:
     levels: str  # the wishes, see `levels.packed`
 
     @staticmethod
-    def of(variance: np.ndarray, effort: np.ndarray | None = None) -> FilmDensity | None:
-        """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise.
-
-        `effort`: what a sample of each pixel costs, relative to any unit; None: the same everywhere.
-        """
+    def of(variance: np.ndarray) -> FilmDensity | None:
+        """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise."""
         spread = np.sqrt(smoothed(np.asarray(variance, np.float64)))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
-        wish = spread / spread.mean() + LEAST_NOISE
-        if effort is not None:
-            wish = wish / np.sqrt(smoothed(effort))
-        return FilmDensity(tuple(spread.shape), packed(wish))
+        return FilmDensity(tuple(spread.shape), packed(spread / spread.mean() + LEAST_NOISE))
 
     @cached_property
     def relative(self) -> np.ndarray:
@@ -76,10 +69,6 @@ class FilmDensity:
     def expected(self) -> np.ndarray:
         """Samples of each pixel relative to the mean, (H, W), if there are many."""
         return EVEN_SHARE + (1 - EVEN_SHARE) * self.relative
-
-    def costs(self, effort: np.ndarray) -> float:
-        """What its samples cost on average, relative to evenly spread ones, if there are many."""
-        return float(np.mean(effort * self.expected) / np.mean(effort))
 
     def gain(self, variance: np.ndarray) -> float:
         """By which factor the mean of `variance` (H, W) of equally many samples falls, if there are many."""

@@ -39,27 +39,25 @@ class FilmNoise:
 
     variance: np.ndarray  # (H, W), of one sample
     samples: float  # per pixel: how many have told
-    effort: np.ndarray | None = None  # (H, W), what a sample costs in any unit; None: the same everywhere
 
     @staticmethod
-    def of(images: Mapping[int, np.ndarray], count: int, effort: np.ndarray | None = None) -> FilmNoise:
+    def of(images: Mapping[int, np.ndarray], count: int) -> FilmNoise:
         """From variances (H, W) between `count` images, by their samples per pixel."""
         noise = [FilmNoise(spp * variance, (count - 1) * spp) for spp, variance in images.items()]
         total = sum(n.samples for n in noise)
-        return FilmNoise(_believed([(n.variance, n.samples / total) for n in noise]), total, effort)
+        return FilmNoise(_believed([(n.variance, n.samples / total) for n in noise]), total)
 
     @cached_property
     def density(self) -> FilmDensity | None:
         """Where samples are wanted; None: nowhere in particular."""
-        return FilmDensity.of(self.variance, self.effort)
+        return FilmDensity.of(self.variance)
 
     def seen(self, variance: np.ndarray, spp: int, calls: int) -> FilmNoise:
         """With the mean variance (H, W) of `calls` images of `spp` samples per pixel, drawn by this density."""
         there = self.density.expected if self.density is not None else 1.0
         before = min(self.samples, calls * spp * (1 / FORGET - 1))
         new = calls * spp / (before + calls * spp)
-        seen = _believed([(self.variance, 1 - new), (spp * there * variance, new)])
-        return FilmNoise(seen, before + calls * spp, self.effort)
+        return FilmNoise(_believed([(self.variance, 1 - new), (spp * there * variance, new)]), before + calls * spp)
 
 
 def _believed(estimates: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:

@@ -19,7 +19,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film_tally import FilmTally
 from ..core.line_guide import LineGuide, LineTally
 from ..plan.job import Job
 from .film_noise import FilmNoise, coarse
@@ -47,8 +46,7 @@ class TermNoise:
 
     at_more: float
     p: float
-    cost: float  # while samples are evenly spread over the film
-    dearer: float = 1.0  # factor on it where there are more of those that cost more
+    cost: float
     film: FilmNoise | None = None  # where it is noisy, if its samples are spread over the film
     lines: LineGuide | None = None  # which lines through edges are worth it, if it samples any
 
@@ -58,27 +56,17 @@ class TermNoise:
         p = math.log(few / more) / math.log(MORE / FEW) if few > 0 and more > 0 else SLOWEST
         return TermNoise(max(more, 0.0), min(max(p, SLOWEST), FASTEST), cost)
 
-    def spread(self, few: np.ndarray, more: np.ndarray, effort: np.ndarray | None) -> TermNoise:
-        """With samples where the film is noisy: as much better as one half of the pilot, (H, W), tells of the other.
-
-        `effort`: what a sample of each pixel costs, relative to others. Noisy pixels may be the costly ones.
-        """
-        told = FilmNoise.of({FEW: few}, IMAGES, effort).density
+    def spread(self, few: np.ndarray, more: np.ndarray) -> TermNoise:
+        """With samples where the film is noisy: as much better as one half of the pilot, (H, W), tells of the other."""
+        told = FilmNoise.of({FEW: few}, IMAGES).density
         gain = max(1.0, told.gain(more)) if told is not None else 1.0
-        film = FilmNoise.of({FEW: few, MORE: more}, IMAGES, effort)
-        dearer = 1.0 if effort is None or film.density is None else film.density.costs(effort)
-        return replace(self, at_more=self.at_more / gain, dearer=dearer, film=film)
+        return replace(self, at_more=self.at_more / gain, film=FilmNoise.of({FEW: few, MORE: more}, IMAGES))
 
     def guided(self, few: LineTally, more: LineTally) -> TermNoise:
         """With lines as the pilot has found them worth; as much better as one half of it tells of the other."""
         # c is f over the number of samples, and there are as many c²
         lines, gain = LineGuide.between(few.moments, more.moments, (FEW / MORE) ** 2)
         return replace(self, at_more=self.at_more / gain, lines=lines)
-
-    @property
-    def price(self) -> float:
-        """Of a path."""
-        return self.cost * self.dearer
 
     def at(self, n: float) -> float:
         return self.at_more * (n / MORE) ** -self.p
@@ -90,7 +78,7 @@ class TermNoise:
 
     def wish(self, price: float, least: float, most: float) -> float:
         """Paths at which one more is worth `price` times its cost."""
-        gain = self.p * self.at_more * MORE**self.p / (self.price * price)
+        gain = self.p * self.at_more * MORE**self.p / (self.cost * price)
         return min(max(gain ** (1 / (self.p + 1)), least), most)
 
 
@@ -114,7 +102,7 @@ class Measurement:
         return Measurement({**self.noise, form: terms})
 
     def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
-        """Paths per pixel by term, with the least variance at the cost of `spp`, evenly spread; of `names` only."""
+        """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""
         terms = {name: self.noise[form][name] for name in self.noise[form] if name in names}
         total = sum(t.cost * spp[name] for name, t in terms.items())
         if not any(t.at_more > 0 for t in terms.values()):
@@ -127,14 +115,14 @@ class Measurement:
         for _ in range(60):
             middle = (low + high) / 2
             found = wishes(math.exp(middle))
-            cheap = sum(terms[name].price * n for name, n in found.items()) > total
+            cheap = sum(terms[name].cost * n for name, n in found.items()) > total
             low, high = (middle, high) if cheap else (low, middle)
         return {**spp, **{name: max(1, round(n)) for name, n in found.items()}}
 
     def efficiency(self, form: str, spp: Mapping[str, int]) -> float:
         """Variance × cost with these budgets; the lower the better."""
         terms = self.noise[form].items()
-        return sum(t.at(spp[name]) for name, t in terms) * sum(t.price * spp[name] for name, t in terms)
+        return sum(t.at(spp[name]) for name, t in terms) * sum(t.cost * spp[name] for name, t in terms)
 
 
 def measure(
@@ -146,27 +134,20 @@ def measure(
         found[form] = {}
         for term in (t for t in TERMS if t.name in names):
             tallies = {spp: LineTally() if term.through_edges else None for spp in (FEW, MORE)}
-            first = job_of(form, FIRST_SEED, FEW)
-            finds = FilmTally(first.film) if term.per_find > 0 else None
             few, more = (
-                _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally, finds=finds))
+                _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally))
                            for k in range(IMAGES)])
                 for spp, tally in tallies.items()
             )  # fmt: skip
-            lit = first.light is not None
+            lit = job_of(form, FIRST_SEED, FEW).light is not None
             cost = term.cost(form, sky) * (term.with_light if lit else 1)
             noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
             if term.over_film:
-                noise = noise.spread(few, more, _effort(finds, term.per_find))
+                noise = noise.spread(few, more)
             if term.through_edges:
                 noise = noise.guided(tallies[FEW], tallies[MORE])
             found[form][term.name] = noise
     return Measurement(found)
-
-
-def _effort(finds: FilmTally | None, per_find: float) -> np.ndarray | None:
-    """What a sample of each pixel or block of pixels costs, in samples that find nothing; None: all the same."""
-    return None if finds is None else 1 + per_find * coarse(finds.finds) / (IMAGES * (FEW + MORE))
 
 
 def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.TensorXf:

@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from ..core.film import filter_reach
 from ..core.film_samples import FilmDensity
-from ..core.film_tally import FilmTally
 from ..core.line_guide import LineGuide, LineTally
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
@@ -52,7 +51,6 @@ class Job:
     density: FilmDensity | None = None  # where on the film samples of this term are wanted; None: everywhere
     guide: LineGuide | None = None  # which lines through edges are; None: all alike
     tally: LineTally | None = None  # wants to know what lines bring
-    finds: FilmTally | None = None  # wants to know where samples find something
 
     @property
     def scene(self) -> mi.Scene:

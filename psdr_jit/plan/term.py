@@ -48,4 +48,3 @@ class Term:
     through_edges: bool = False  # its samples are lines through edges that can be guided
     with_light: float = 1.0  # factor on the cost where light subpaths run
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy
-    per_find: float = 0.0  # cost of what a sample finds, in samples that find nothing; 0: all cost about the same

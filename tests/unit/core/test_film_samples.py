@@ -9,7 +9,6 @@ import pytest
 
 from psdr_jit.core import film as films
 from psdr_jit.core.film_samples import EVEN_SHARE, FilmDensity, FilmSamples
-from psdr_jit.core.film_tally import FilmTally
 
 SPP, WIDTH, HEIGHT = 8, 6, 5
 
@@ -34,32 +33,6 @@ def test_every_pixel_has_its_share_and_the_noisy_ones_the_rest(llvm):
     assert counts.sum() == SPP * WIDTH * HEIGHT
     assert counts.min() == EVEN_SHARE * SPP
     assert counts[:2, :2].min() > 3 * SPP
-
-
-def test_costly_pixels_have_fewer_samples(llvm):
-    """n ∝ √(v/c): at equal costs no other spread that is near has less variance."""
-    rng = np.random.default_rng(3)
-    columns = np.repeat(rng.uniform(0.5, 2, 4), 10)  # broad, so that neighbours are alike
-    variance, effort = np.tile(columns**2, (40, 1)), np.tile(np.repeat([1.0, 30.0, 2.0, 9.0], 10), (40, 1))
-    blind, aware = FilmDensity.of(variance), FilmDensity.of(variance, effort)
-
-    def variance_times_cost(density: FilmDensity) -> float:
-        return np.mean(variance / density.relative) * np.mean(effort * density.relative)
-
-    least = np.mean(np.sqrt(variance * effort)) ** 2
-    assert variance_times_cost(aware) < 1.1 * least < 1.3 * least < variance_times_cost(blind)
-    assert aware.costs(effort) < blind.costs(effort)
-    assert aware.costs(effort) == pytest.approx(np.mean(effort * aware.expected) / effort.mean())
-
-
-def test_finds_are_told_by_pixel(llvm):
-    """On the crop window; what lies beside it counts for the nearest pixel."""
-    tally = FilmTally(film(crop_offset_x=2, crop_offset_y=1, crop_width=3, crop_height=4))
-    for _ in range(2):
-        tally.add(mi.Point2f([2.5, 4.9, 9.0, 0.0], [1.5, 4.9, 9.0, 3.5]))
-    expected = np.zeros((4, 3))
-    expected[0, 0], expected[3, 2], expected[2, 0] = 2, 4, 2
-    assert (tally.finds == expected).all()
 
 
 def test_text_and_back(llvm):

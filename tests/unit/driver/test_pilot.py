@@ -50,17 +50,6 @@ def test_independent_samples_follow_the_square_root_rule():
     assert n["interior"] + n["primary"] + 4 * n["direct"] == pytest.approx(6 * 60, rel=0.03)
 
 
-def test_samples_that_find_much_are_paid_for():
-    """Spread to where they find something, samples cost more than evenly spread ones: there are fewer of them."""
-    measured = noise(interior=(1.0, 1.0, 1.0), chain=(1.0, 1.0, 4.0))
-    spread = replace(measured.noise["spatial"]["chain"], dearer=4.0)
-    measured = Measurement({"spatial": {**measured.noise["spatial"], "chain": spread}})
-    spp = {"interior": 60, "chain": 60}
-    n = measured.allocate("spatial", spp, spp)
-    assert n["chain"] == pytest.approx(n["interior"] / 4, rel=0.06)
-    assert n["interior"] + 16 * n["chain"] == pytest.approx(5 * 60, rel=0.06)
-
-
 @pytest.mark.parametrize("p", [1.0, 1.7, 3.0])
 def test_nothing_nearby_is_better(p):
     measured = noise(interior=(3.0, 1.0, 1.0), primary=(0.5, p, 1.2), direct=(9.0, 1.3, 2.5))
