@@ -15,7 +15,7 @@ from test_smooth_caustics import INTERIOR, LIMITS, SEEDS, TOLERANCE, X, bdpt, fi
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
 
-FAR, NEARER = 3000.0, 300.0  # of images; of derivatives, for which directions in float32 must be told apart
+FAR, NEARER = 3000.0, 1000.0  # of images; of derivatives, for which directions in float32 must be told apart
 TO = np.array([-0.31, -0.91, 0.23]) / np.linalg.norm([-0.31, -0.91, 0.23])  # of the light
 SLOW = pytest.mark.slow
 
@@ -48,11 +48,12 @@ def glass(far: bool, body: str = "ball", card: bool = False, r: float = FAR) -> 
     T = mi.ScalarTransform4f
     view = T().look_at(origin=[-1.6, 1.0, 1.6], target=[-0.35, -1, 0.35], up=[0, 1, 0])
     turned = T().translate([0, -0.35, 0]).rotate([0.436, 0.873, 0.218], 40).scale(0.3)
-    bodies = {"ball": {"type": "sphere", "center": [0, -0.15, 0], "radius": 0.5},
-              "cube": {"type": "cube", "to_world": turned}}  # fmt: skip
+    ball, smooth = {"type": "sphere", "center": [0, -0.15, 0], "radius": 0.5}, {"type": "psdr_dielectric"}
+    bodies = {"ball": {**ball, "bsdf": smooth}, "cube": {"type": "cube", "to_world": turned, "bsdf": smooth},
+              "rough ball": {**ball, "bsdf": {"type": "roughdielectric", "alpha": 0.15}}}  # fmt: skip
     scene = {"type": "scene", "lamp": sun(TO) if far else far_point([0, -0.15, 0], r), "floor": floor(),
              "camera": {"type": "perspective", "to_world": view, "film": film(), "fov": 40},
-             "body": {**bodies[body], "bsdf": {"type": "psdr_dielectric"}}}  # fmt: skip
+             "body": bodies[body]}  # fmt: skip
     if card:
         at = np.array([0, -0.15, 0]) - 1.3 * TO + [0.05, 0, 0]
         pose = T().look_at(origin=list(at), target=list(at + TO), up=[1, 0, 0]) @ T().scale(0.1)
@@ -92,17 +93,30 @@ def test_image_of_glass(llvm, body):
     assert np.abs(z_scores(0.97 * far, near, np.ones_like(weights[:1]))).max() > 5, "no power to tell 3 %"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("light_paths", ["auto", "only"])
+def test_image_of_rough_glass(llvm, light_paths):
+    """Where camera paths find the light as well: weights of both ways add up to one."""
+    scene = glass(True, "rough ball")
+    path = images(scene, {"type": "path", **LIMITS}, 2048, first=1000)
+    ours = images(scene, bdpt(light_paths=light_paths), 256)
+    weights = functionals(ours.shape[1:])
+    assert np.abs(z_scores(ours, path, weights)).max() < 5
+    assert np.abs(z_scores(0.95 * ours, path, np.ones_like(weights[:1]))).max() > 5, "no power to tell 5 %"
+
+
 CASES = [
-    ("lamp", {}, dict(card=True)), ("card.to_world", dict(direction=X), dict(card=True)),
-    ("body.bsdf.eta", {}, {}), ("body.to_world", dict(direction=X), {}), ("camera.to_world", dict(direction=X), {}),
-    ("body.vertex_positions", dict(direction=X), dict(body="cube")),
+    ("lamp", {}, dict(card=True), 64), ("card.to_world", dict(direction=X), dict(card=True), 512),
+    ("body.bsdf.eta", {}, {}, 64), ("body.to_world", dict(direction=X), {}, 64),
+    ("camera.to_world", dict(direction=X), {}, 64),
+    ("body.vertex_positions", dict(direction=X), dict(body="cube"), 128),
 ]  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("param, how, scene", CASES, ids=lambda value: value if isinstance(value, str) else "")
-def test_derivatives_by_what_is_far(llvm, param, how, scene):
-    exact, ours = (forward(_motion(glass(far, r=NEARER, **scene), param, far, how), bdpt(form="spatial"), SEEDS, 64)
+@pytest.mark.parametrize("param, how, scene, spp", CASES, ids=lambda value: value if isinstance(value, str) else "")
+def test_derivatives_by_what_is_far(llvm, param, how, scene, spp):
+    exact, ours = (forward(_motion(glass(far, r=NEARER, **scene), param, far, how), bdpt(form="spatial"), SEEDS, spp)
                    for far in (False, True))  # fmt: skip
     assert_grad_close(ours, exact, max_stderr=0.05)
 
