@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.cones import Cones
 from ..edges.kind import Use
 from ..plan.job import Job
-from ..sampling.directions import Cones
 from ..sampling.mirror_images import SeenBall, SeenBalls, with_images
 from ..sampling.relevance import Movers, movers_of
 

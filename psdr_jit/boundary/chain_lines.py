@@ -6,7 +6,7 @@ which they leave smooth vertices, is drawn before they are traced (`chain_fixed`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +16,7 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.rays import skip_emitters
 from ..plan.job import Job
+from .chain_aims import ChainAims
 from .chain_fixed import Directions
 from .chain_trace import ChainWorld
 from .searched_lines import SearchedLines
@@ -55,6 +56,8 @@ class Lines(SearchedLines):
     @staticmethod
     def of(job: Job) -> Lines:
         world = ChainWorld.of(job)
+        if world.scatters:
+            world = replace(world, aims=ChainAims.of(job))
         samples = FilmSamples.over(job.film, job.spp, job.density)
         lines = Lines(job, world, samples, Directions(samples.count if world.scatters else 0, world.depth))
         lines.guide()

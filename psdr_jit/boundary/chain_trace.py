@@ -77,7 +77,6 @@ class ChainWorld:
             scatters=facts.scatters,
             mode=mi.TransportMode.Radiance,
             followed=followed_lights(job),
-            aims=ChainAims.of(job),
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:

@@ -28,13 +28,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.cones import towards_sphere
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.sensor_frame import SensorFrame, View, look_at
 from ..core.streams import Stream, stream_seed
 from ..core.upload import uploaded
 from ..core.varying import varying
-from ..paths.light_source import Ball, LightSources, beam_density, cone, in_beam, in_cone, is_far, place_of, shone
+from ..paths.light_source import Ball, LightSources, beam_density, beam_pdf, is_far, place_of, shone
 from ..paths.light_technique import LightTechnique
 from ..paths.rays import skip_emitters
 from ..paths.sensor_connection import on_film
@@ -132,7 +133,6 @@ def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
         lights=varying(mi.Bool, job.facts.camera_moves),
         connects=partial(compare_sensor, technique, job.options.hide_emitters),
         mode=mi.TransportMode.Importance,
-        aims=None,
     )
 
 
@@ -194,24 +194,22 @@ class LightLines(SearchedLines):
         self, light: mi.EmitterPtr, place: mi.Point3f, ball: Ball, far: mi.Bool
     ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float]:
         """The rays of a light, at `place`, that meet a ball: `(start, axis, 1 / measure)`."""
-        axis, _, density = cone(ball, place)
+        cone = towards_sphere(place, *ball)
         if self.sources.around is None:
-            return place, axis, density
+            return place, cone.axis, cone.density
         ω = shone(light, far)
         y = dr.select(far, self.sources.start_of(ball[0], ω), place)
-        return y, dr.select(far, ω, axis), dr.select(far, beam_density(ball), density)
+        return y, dr.select(far, ω, cone.axis), dr.select(far, beam_density(ball), cone.density)
 
     def measure(self, line: LightLine, p: mi.Point2f) -> mi.Float:
         """Solid angle or area of a cell, times the share of its cone in what others overlap; 0 off the cone."""
         ω, total = line.direction(p), mi.Float(0)
         off = p - CELLS / 2
         for ball in self._targets:
-            axis, cap, density = cone(ball, line.y)
-            meets = in_cone(axis, cap, ω)
+            density = towards_sphere(line.y, *ball).pdf(ω)
             if self.sources.around is not None:
-                meets = dr.select(line.far, in_beam(ball, line.origin(p), ω), meets)
-                density = dr.select(line.far, beam_density(ball), density)
-            total += dr.select(meets, density, 0)
+                density = dr.select(line.far, beam_pdf(ball, line.origin(p), ω), density)
+            total += density
         share = dr.minimum(line.density / total, 1)
         inside = (dr.squared_norm(off) <= CELLS**2 / 4) & (total > 0)
         return dr.select(inside, dr.square(line.cell) * share, 0)

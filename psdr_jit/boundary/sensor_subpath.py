@@ -237,7 +237,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     path = PathState.start(1)
     active = mi.Bool(True)
     awaited = Awaited.of(job, receivers.waits)
-    waits = mi.Bool(awaited is not None) if awaited is None else mi.Bool(receivers.waits)
+    waits = mi.Bool(False) if awaited is None else mi.Bool(receivers.waits)
     while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits, awaited]):
         si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()

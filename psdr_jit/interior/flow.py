@@ -75,34 +75,28 @@ class Flow(ABC):
         """
 
 
-def material_segment(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool):
+def material_segment(
+    x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool, rests: bool = False
+):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
     `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
-    direction stays as it is.
+    direction stays as it is. `rests`: the point and |dA| are known to rest, which spares the way back to vertices.
     """
-    si = _material(x, hit, wavelengths, moves, active)
-    ω, measure = _towards(x, hit, si, _area_element(si, active & si.is_valid()), active)
-    return si, ω, measure
-
-
-def _material(x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool):
-    """The material point `hit`, which a ray from `x` meets."""
-    return moves.material(hit, mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths), active)
-
-
-def _towards(x: mi.Point3f, hit: Hit, si, area: mi.Float, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
-    """`(ω, measure)` of `material_segment` to the material point `si`."""
+    ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
+    with dr.suspend_grad(when=rests):
+        si = moves.material(hit, ray, active)
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
     ω = mi.Vector3f(hit.d)
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
+    area = mi.Float(1) if rests else _area_element(si, on_surface)
     cos = dr.abs_dot(si.n, ω)
     # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
     usable = on_surface & (cos > GRAZING) & (area > 0)
     measure = dr.select(usable, cos / dist2 * area, 1)
-    return ω, dr.relative_grad(measure)
+    return si, ω, dr.relative_grad(measure)
 
 
 def emission_towards(
@@ -110,14 +104,9 @@ def emission_towards(
 ):
     """Emission of the material point `hit` towards the attached point `x`: `(point, ω, L_e · measure)`, attached.
 
-    `rests`: `SceneTraits.lights_rest`, which spares the way back to vertices of lights.
+    `rests`: `SceneTraits.lights_rest`.
     """
-    if not rests:
-        si, ω, measure = material_segment(x, hit, wavelengths, moves, active)
-        return si, ω, emitter.eval(si, active) * measure
-    with dr.suspend_grad():
-        si = _material(x, hit, wavelengths, moves, active)
-    ω, measure = _towards(x, hit, si, mi.Float(1), active)
+    si, ω, measure = material_segment(x, hit, wavelengths, moves, active, rests)
     return si, ω, emitter.eval(si, active) * measure
 
 

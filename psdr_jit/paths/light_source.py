@@ -24,6 +24,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
+from ..core.cones import towards_sphere
 from ..core.varying import varying
 
 #: Radius of a target's ball relative to that of the sphere around it: rounding must not leave its rim outside.
@@ -74,8 +75,8 @@ class LightSources:
         ω = self._aim(si.p, u_target, v)
         if self.around is not None:
             far = is_far(emitter)
-            si.p = dr.select(far, self._from_afar(emitter, u_target, v, far), si.p)
             ω = dr.select(far, shone(emitter, far), ω)
+            si.p = dr.select(far, self._from_afar(ω, u_target, v), si.p)
         si.wi = si.to_local(ω)
         radiance = emitter.eval(si, ~delta)
         ray = si.spawn_ray(ω)
@@ -88,23 +89,16 @@ class LightSources:
         scaled = u * n
         ω = mi.Vector3f(0, 0, 1)
         for i, ball in enumerate(self.targets):
-            axis, cap, _ = cone(ball, y)
-            of_ball = mi.Frame3f(axis).to_world(_square_to_cone(v, cap))
-            ω = dr.select((scaled >= i) | (i == 0), of_ball, ω)
+            ω = dr.select((scaled >= i) | (i == 0), towards_sphere(y, *ball).sample(v), ω)
         return ω
 
     def _aimed_pdf(self, y: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
         """Density p(ω) per solid angle of `_aim`."""
-        pdf = mi.Float(0)
-        for ball in self.targets:
-            axis, cap, inverse_angle = cone(ball, y)
-            pdf += dr.select(in_cone(axis, cap, ω), inverse_angle, 0)
-        return pdf / len(self.targets)
+        return sum(towards_sphere(y, *ball).pdf(ω) for ball in self.targets) / len(self.targets)
 
-    def _from_afar(self, emitter: mi.EmitterPtr, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        """The start of a ray of a directional light that meets one of the targets' balls."""
-        n, ω = len(self.targets), shone(emitter, active)
-        disk, scaled = mi.warp.square_to_uniform_disk_concentric(v), u * n
+    def _from_afar(self, ω: mi.Vector3f, u: mi.Float, v: mi.Point2f) -> mi.Point3f:
+        """The start of a ray along ω that meets one of the targets' balls."""
+        disk, scaled = mi.warp.square_to_uniform_disk_concentric(v), u * len(self.targets)
         across, x = mi.Frame3f(ω).to_world(mi.Vector3f(disk.x, disk.y, 0)), mi.Point3f(0)
         for i, (centre, radius) in enumerate(self.targets):
             x = dr.select((scaled >= i) | (i == 0), centre + radius * across, x)
@@ -117,10 +111,7 @@ class LightSources:
 
     def _beams_pdf(self, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
         """Density p_⊥ per area across ω of rays through `x`."""
-        pdf = mi.Float(0)
-        for ball in self.targets:
-            pdf += dr.select(in_beam(ball, x, ω), beam_density(ball), 0)
-        return pdf / len(self.targets)
+        return sum(beam_pdf(ball, x, ω) for ball in self.targets) / len(self.targets)
 
     def segment_density(
         self, emitter: mi.UInt32, y: mi.Point3f, n: mi.Normal3f, x: mi.Point3f, active: mi.Bool
@@ -159,44 +150,17 @@ def shone(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Vector3f:
     return dr.select(active, -mi.Vector3f(dr.detach(ds.d)), mi.Vector3f(0, 0, 1))
 
 
-def in_beam(ball: Ball, x: mi.Point3f, ω: mi.Vector3f) -> mi.Bool:
-    """Does the line along ω through `x` meet the ball?"""
+def beam_pdf(ball: Ball, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
+    """`beam_density` if the line along ω through `x` meets the ball, else 0."""
     centre, radius = ball
     off = x - centre
-    return dr.squared_norm(off - ω * dr.dot(off, ω)) <= dr.square(radius)
+    meets = dr.squared_norm(off - ω * dr.dot(off, ω)) <= dr.square(radius)
+    return dr.select(meets, beam_density(ball), 0)
 
 
 def beam_density(ball: Ball) -> mi.Float:
     """1 / area of the disk that a ball hides of parallel rays."""
     return dr.inv_pi / dr.square(ball[1])
-
-
-def cone(ball: Ball, y: mi.Point3f) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
-    """The cone in which `y` sees a ball: `(unit axis, 1 − cosine of its half angle, 1/Ω)`; from inside, all directions.
-
-    Seen from a thousand radii away, the cosine itself is 1 but for rounding.
-    """
-    centre, radius = ball
-    to_centre = centre - y
-    dist2 = dr.squared_norm(to_centre)
-    sin2 = dr.square(radius) / dist2
-    outside = sin2 < 1
-    cap = dr.select(outside, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2)
-    axis = dr.select(dist2 > 0, to_centre * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
-    return axis, cap, dr.inv_two_pi / cap
-
-
-def in_cone(axis: mi.Vector3f, cap: mi.Float, ω: mi.Vector3f) -> mi.Bool:
-    """Is the angle between two unit vectors at most that with the cosine 1 − `cap`?"""
-    return dr.squared_norm(ω - axis) <= 2 * cap
-
-
-def _square_to_cone(u: mi.Point2f, cap: mi.Float) -> mi.Vector3f:
-    """`mi.warp.square_to_uniform_cone`, which takes the cosine, for cones however narrow."""
-    p = mi.warp.square_to_uniform_disk_concentric(u)
-    down = cap * dr.squared_norm(p)
-    p *= dr.safe_sqrt(cap * (2 - down))
-    return mi.Vector3f(p.x, p.y, 1 - down)
 
 
 def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int], most: int) -> LightSources:

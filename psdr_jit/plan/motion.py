@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..core.ad import tangents
 from ..core.records import Hit
 from ..core.sensor_frame import film_area
+from ..paths.light_source import is_far
 from ..paths.tube_surface import surface_at
 from ..scene.tubes import Tubes
 
@@ -57,8 +58,7 @@ class Displacements(ABC):
         it = dr.zeros(mi.Interaction3f)
         it.p = hit.o + hit.d * r
         of_place, towards = self.of_light(emitter, it, active)
-        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
-        return dr.select(far, self.of_surface(hit) + r * towards, of_place)
+        return dr.select(is_far(emitter), self.of_surface(hit) + r * towards, of_place)
 
     @abstractmethod
     def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:

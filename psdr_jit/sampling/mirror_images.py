@@ -15,11 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers, mesh_positions
+from ..core.cones import Cone, Cones, towards_sphere
 from ..core.memory import Slot, while_unchanged
 from ..core.varying import varying
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
-from .directions import Cone, Cones, towards_sphere
 
 #: Balls and images that are looked at one by one, at most: each is a cone for every direction that is drawn.
 MOST_SEEN = 10
@@ -28,7 +28,7 @@ MOST_SEEN = 10
 FLAT, MOST_VERTICES = 1e-4, 4096
 
 #: Of an integrator: the planes of meshes by their number, while they stay as they are.
-PLANES: Slot[dict] = Slot(dict)
+PLANES: Slot[dict[int, tuple[list, PlaneMirror | None]]] = Slot(dict)
 
 
 @dataclass(frozen=True)

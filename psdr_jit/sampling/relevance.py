@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.cones import Cones
+from ..core.memory import Slot
 from ..core.varying import varying
 from ..edges.kind import Use, Views
 from ..edges.lights import LightBounds
@@ -22,7 +24,7 @@ from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable
 from ..edges.wedges import Wedges
 from ..plan.job import Job
-from .directions import Cones, pdf_view, sample_view
+from .directions import pdf_view, sample_view
 from .mirror_images import SeenBall, SeenBalls, with_images
 from .rows import ROW_SAMPLER, SampledRows, row_state
 
@@ -52,6 +54,10 @@ class Movers:
 
     def seen_from(self, x: mi.Point3f) -> Cones:
         return self.seen.seen_from(x)
+
+
+#: Of one render call: what moves, by what lines through edges are drawn for.
+MOVERS: Slot[dict[Use, Movers | None]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -123,10 +129,17 @@ def line_weights(job: Job, use: Use) -> list[mi.Float]:
 
 
 def movers_of(job: Job, use: Use) -> Movers | None:
-    """What moves, if only some shapes do.
+    """What moves, if only some shapes do; found once per render call.
 
     None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves.
     """
+    known = job.shared[MOVERS]
+    if use not in known:
+        known[use] = _found_movers(job, use)
+    return known[use]
+
+
+def _found_movers(job: Job, use: Use) -> Movers | None:
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]

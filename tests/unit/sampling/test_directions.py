@@ -62,8 +62,9 @@ def test_a_closed_box_is_not_looked_at_from_inside(variant):
 @pytest.mark.parametrize("distance", [0.5, 3.0, 300.0])
 def test_the_mixture_of_a_resting_edge(variant, distance, ahead):
     """The density of `sample_view` integrates to one, by importance sampling with itself and with its parts."""
+    from psdr_jit.core.cones import towards_sphere
     from psdr_jit.edges.wedges import silhouette_wedges
-    from psdr_jit.sampling.directions import pdf_view, sample_view, towards_sphere
+    from psdr_jit.sampling.directions import pdf_view, sample_view
 
     rng = np.random.default_rng(2)
     edge = lanes(rows("cube"), 0)
@@ -83,7 +84,7 @@ def test_the_mixture_of_a_resting_edge(variant, distance, ahead):
 
 
 def test_cone(variant):
-    from psdr_jit.sampling.directions import towards_sphere
+    from psdr_jit.core.cones import towards_sphere
 
     rng = np.random.default_rng(3)
     x, centre = mi.Point3f(1, 2, 3), mi.Point3f(4, -2, 3)
