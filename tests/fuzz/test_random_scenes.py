@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import os
 import pprint
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from fuzz import verdict
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
-from fuzz.verdict import VARIANT, WRONG, Effort, Outcome, examine
+from fuzz.verdict import RIGHT, VARIANT, WRONG, Effort, Look, Outcome, examine
 from variants import activate
 
+from psdr_jit.derivative.statistics import Gain
 from psdr_jit.scene.params import find_param
 
 FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
@@ -81,5 +85,18 @@ def test_a_missing_term_is_found(mono):
     case = case_of(WITH_OUTLINES)
     case["integrator"] |= {"sppc": 1, "sppp": 0, "sppd": 1, "sppi": 1}
     quick = Effort(seeds=16, spp=256, reference_spp=512, doublings=3, precision=0.02, first_seed=0)
-    assert examine(case, quick, quick).word == WRONG
+    assert examine(case, (quick, quick)).word == WRONG
 
+
+@pytest.mark.parametrize(("gains", "word"), [((0.9, 0.96, 1.0), RIGHT), ((0.9, 0.9, 0.9), WRONG), ((1.0,), RIGHT)])
+def test_what_goes_away_with_the_step_is_the_differences(monkeypatch, gains, word):
+    def look(motion, case, effort, finer=1.0) -> Look:
+        found = gains[steps.index(finer)]
+        return Look(Gain(found, 0.003, 0.003, 1.0, 0.01), 0.0, verdict.TOLERANCE, True, np.ones(1), np.ones(1))
+
+    steps = [verdict.FINER**i for i in range(3)]
+    monkeypatch.setattr(verdict, "compare", look)
+    monkeypatch.setattr(verdict, "motion_of", lambda case: None)
+    monkeypatch.setattr(verdict, "_estimate", lambda *_: SimpleNamespace(add=lambda count: None))
+    monkeypatch.setattr(verdict, "asymmetry", lambda *_: 0.0)
+    assert examine({}).word == word

@@ -1,16 +1,17 @@
 """Is the derivative of a case right? Against central differences, at five standard errors, in two looks.
 
-The first look is cheap. What it suspects is looked at again with independent seeds, more of them, and a smaller step;
-only what is off in the same way then counts, so that a hundred seeds with some forty comparisons each give no false
-alarm. Where the image has a kink at the scene as it is (surfaces that touch, a corner that appears), the differences to
-either side disagree however small the step is: there is no derivative to be wrong about.
+The first look is cheap. What it suspects is looked at again with independent seeds, more of them, and a smaller step,
+and once more with a still smaller one. Only what is off then, too, counts: a hundred seeds with some forty comparisons
+each give no false alarm, nor does what differences leave out between their steps. Where the image has a kink at the
+scene as it is (surfaces that touch, a corner that appears), the differences to either side disagree however small the
+step is: there is no derivative to be wrong about.
 """
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,7 +35,7 @@ TOLERANCE = 0.02  # of the gain, and of the largest block: what finite steps lea
 BLOCK = 4  # [px]
 KNOWN_ENOUGH = 0.1  # standard error of a gain that could still tell half of the derivative from all of it
 GROUPS = 32  # of seeds, from whose scatter errors are measured
-FINER = 3.0  # by how much the second look's step is smaller
+FINER = 3.0  # by how much each further look's step is smaller
 KINK_SHARE = 0.5  # of the differences' asymmetry that a smaller step must leave; that of a smooth image goes with it
 
 
@@ -52,6 +53,7 @@ class Effort:
 
 FIRST = Effort(seeds=8, spp=128, reference_spp=512, doublings=3, precision=0.02, first_seed=0)
 SECOND = Effort(seeds=16, spp=256, reference_spp=1024, doublings=4, precision=0.006, first_seed=1000)
+THIRD = replace(SECOND, doublings=5, first_seed=5000)
 
 
 @dataclass(frozen=True)
@@ -91,14 +93,14 @@ class Outcome:
         return self.word in (WRONG, REFUSED)
 
 
-def examine(case: Mapping[str, Any], first: Effort = FIRST, second: Effort = SECOND) -> Outcome:
-    """Look at a case once, and again if it seems wrong."""
+def examine(case: Mapping[str, Any], efforts: Sequence[Effort] = (FIRST, SECOND, THIRD)) -> Outcome:
+    """Look at a case once, and again with smaller steps as long as it seems wrong."""
     start = time.perf_counter()
-    word, text = _examine(case, first, second)
+    word, text = _examine(case, *efforts)
     return Outcome(word, text, time.perf_counter() - start)
 
 
-def _examine(case: Mapping[str, Any], first: Effort, second: Effort) -> tuple[str, str]:
+def _examine(case: Mapping[str, Any], first: Effort, *others: Effort) -> tuple[str, str]:
     motion = motion_of(case)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UnsupportedWarning)
@@ -112,12 +114,15 @@ def _examine(case: Mapping[str, Any], first: Effort, second: Effort) -> tuple[st
         look = compare(motion, case, first)
     if not look.wrong:
         return (NOISY if look.blind else RIGHT), str(look)
-    again = compare(motion, case, second, FINER)
-    if not again.wrong:
-        return RIGHT, f"{again}, after {look}"
-    share = asymmetry(motion, case, second)
+    before = str(look)
+    for number, effort in enumerate(others, 1):
+        look = compare(motion, case, effort, FINER**number)
+        if not look.wrong:
+            return RIGHT, f"{look}, after {before}"
+        before = f"{look}, after {before}"
+    share = asymmetry(motion, case, others[0])
     word = KINK if share > KINK_SHARE else WRONG
-    return word, f"{again}, after {look}; a smaller step leaves {share:.2f} of the differences' asymmetry"
+    return word, f"{before}; a smaller step leaves {share:.2f} of the differences' asymmetry"
 
 
 def motion_of(case: Mapping[str, Any]) -> Perturbation:
