@@ -110,10 +110,12 @@ class Pair:
 
     @staticmethod
     def start() -> Pair:
-        no, hit = mi.Bool(False), Hit.made(dr.zeros, 1)
+        """No two of its arrays may be one object: loops change them in place."""
+        differs, specular, chosen, moves, in_light, seen = (mi.Bool(False) for _ in range(6))
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
-        k, family, β = mi.UInt32(0), mi.UInt32(NO_FAMILY), mi.Spectrum(1)
-        return Pair(k, no, no, no, no, mi.Bool(True), no, no, family, mi.Float(0.5), light, hit, hit, β, β)
+        a, b = (Hit.made(dr.zeros, 1) for _ in range(2))
+        return Pair(mi.UInt32(0), differs, specular, chosen, moves, mi.Bool(True), in_light, seen, mi.UInt32(NO_FAMILY),
+                    mi.Float(0.5), light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
 
     @property
     def last(self) -> mi.UInt32:
