@@ -27,6 +27,7 @@ from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
 
 COUNT = 4096
+RADIUS, DISTANCE = 0.6, 4.0
 SHIFT = (0.48, 0.6, 0.64)
 PLACED = ("vertex_positions", "to_world", "control_points", "data")
 STRIDES = {"control_points": 4, "data": 10}
@@ -188,3 +189,24 @@ def test_directions_of_fixed_edges_have_the_density_they_say(found):
         assert drawn.any()
         agree = np.isclose(np.array(w.pdf(ω)), np.array(pdf), rtol=1e-3)[drawn]
         assert agree.mean() > 0.99  # rounding may put a sample on the other side of a wedge's border
+
+
+def test_rays_from_what_an_outline_hides_start_outside_of_the_shape(llvm):
+    """Also close to where a wall cuts into it: Mitsuba lifts their starts, towards the shape."""
+    T = mi.ScalarTransform4f
+    ball = {"type": "sphere", "radius": RADIUS}
+    wall = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 20).translate([0, 0, -0.9 * RADIUS]).scale(3)}
+    sensor = {"type": "perspective", "to_world": T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "wall": wall, "light": {"type": "constant"}, "sensor": sensor,
+                          "integrator": {"type": "psdr_path", "max_depth": 2, "sppc": 1}})  # fmt: skip
+    with also_enabled(scene, ["ball.to_world"]):
+        job = prepare(scene.integrator().call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]
+        (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, AnalyticCurves))
+    row, t, rng = rows_of(kind)
+    on, ω = lines(kind, row, t, rng)
+    sight = Sight.of(on, row, t, ω, mi.Float(DISTANCE), on.across(ω)[0])
+    side = kind.side(row, sight, mi.UInt32(1), on.valid)
+    si = scene.ray_intersect(side.ray, on.valid)
+    met = np.array(si.is_valid() & (dr.dot(si.n, side.ray.d) < 0))
+    start = np.array(dr.norm(si.spawn_ray(si.n).o))[met]
+    assert met.sum() > COUNT / 100 and (start > RADIUS).all()
