@@ -51,8 +51,8 @@ PROBLEMS = (
     Problem("textured_emitter", "card.vertex_texcoords", 0.003),
     Problem("coloured_emitter", "card.vertex_color", 0.01),
     Problem("coloured_emitter", "card.vertex_positions", 0.004, direction=X, slow=True),
-    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=X, slow=True),
-    Problem("emitter_sphere", "bulb.to_world", 0.005, direction=Y, slow=True),
+    Problem("emitter_sphere", "bulb.to_world", 0.002, direction=X, slow=True),
+    Problem("emitter_sphere", "bulb.to_world", 0.002, direction=Y, slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, direction=Y, slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, rotate=(1, 1, 0), slow=True),
     Problem("emitter_mesh", "card.vertex_positions", 0.005, index=1, tag="stretch", slow=True),
@@ -103,7 +103,7 @@ PROBLEMS = (
     Problem("rough_dielectric", "ball.bsdf.alpha.value", 0.004, slow=True),
     Problem("rough_dielectric", "ball.to_world", 0.006, direction=X, slow=True),
     # films and options
-    Problem("disk_rim", "disk.to_world", 0.005, direction=X, load=RGBA, tag="alpha-environment"),
+    Problem("disk_rim", "disk.to_world", 0.002, direction=X, load=RGBA, tag="alpha-environment"),
     Problem("textured_emitter", "card.vertex_positions", 0.004, direction=X, load=RGBA, tag="alpha", slow=True),
     Problem("hidden_emitter", "card.vertex_positions", 0.005, direction=X, load=RGBA, options=HIDDEN, slow=True),
     # edges in contact
