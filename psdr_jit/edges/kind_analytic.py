@@ -23,10 +23,7 @@ from .curves import (
 )
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
-from .points import INSET, VISIBILITY_EPSILON, clear_of_lift, clearance
-
-#: How far beside an outline the other side is looked at, at most: the share of the viewer's distance.
-LARGEST_STEP = 1e-3
+from .points import INSET, VISIBILITY_EPSILON, clearance, step_past_lift
 
 
 @dataclass(frozen=True)
@@ -97,17 +94,10 @@ class AnalyticCurves(ContourKind):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.shape = dr.gather(mi.ShapePtr, self.curves.pointers, rows.shape, pi.valid)
         pi.prim_uv = mi.Point2f(local.x, local.y)  # of a disk; the others ask for the point alone
-        beside = replace(sight, offset=self._step(sight)).beside(which)
+        past = replace(sight, offset=step_past_lift(at.x, sight.offset, sight.r))
+        beside = past.beside(which)
         ray = mi.Ray3f(dr.select(own, transform_point(columns, local) - sight.r * sight.ω, beside.o), beside.d)
         return Side(ray, pi, ~own, own, mi.Bool(True))
-
-    def _step(self, sight: Sight) -> mi.Float:
-        """Sideways distance at which the other side is looked at.
-
-        Where the shape cuts into another, what it hides begins beside its outline. Mitsuba starts rays a height above
-        that: nearer to the outline they start inside of the shape, in the dark.
-        """
-        return dr.maximum(sight.offset, dr.minimum(clear_of_lift(sight.at.x), LARGEST_STEP * sight.r))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""

@@ -32,6 +32,9 @@ MITSUBA_LIFT = 8.9e-5
 #: We stay clear of that by this factor; of surfaces that meet almost flush, as if by this sine of their angle.
 CLEAR_OF_LIFT, LEAST_SLANT = 2.0, 0.05
 
+#: Largest step aside that is taken to stay clear of it: this share of the viewer's distance.
+LARGEST_STEP = 1e-3
+
 #: Sine of the angle to its plane below which a face is seen edge-on: sixteen units in the last place of a direction.
 EDGE_ON = 1e-6
 
@@ -58,6 +61,15 @@ def start_height(x: mi.Point3f) -> mi.Float:
 def clear_of_lift(x: mi.Point3f) -> mi.Float:
     """A height above a surface at `x` that is more than that [m]."""
     return CLEAR_OF_LIFT * start_height(x)
+
+
+def step_past_lift(x: mi.Point3f, offset: mi.Float, r: mi.Float) -> mi.Float:
+    """Sideways distance, `offset` or more, at which what an outline at `x` hides is looked at from the distance r [m].
+
+    Where the shape cuts into another, what it hides begins beside its outline. Rays that Mitsuba starts nearer to the
+    outline than its height start inside of the shape, in the dark.
+    """
+    return dr.maximum(offset, dr.minimum(clear_of_lift(x), LARGEST_STEP * r))
 
 
 def face_inset(p0: mi.Point3f, p1: mi.Point3f, apex: mi.Point3f, n0: mi.Normal3f, n1: mi.Normal3f) -> mi.Float:

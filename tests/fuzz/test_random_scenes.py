@@ -22,8 +22,9 @@ from psdr_jit.scene.params import find_param
 FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
-#: Seeds that were wrong once: a shadow thinner than the height at which rays start; a contact on a face seen edge-on.
-FOUND = (461, 509, 544, 704)
+#: Seeds that were wrong once: a shadow thinner than the height at which rays start; a contact on a face seen edge-on;
+#: a ball that cuts into a prism, where its outline comes out of it.
+FOUND = (461, 509, 544, 704, 2082)
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
@@ -88,15 +89,18 @@ def test_a_missing_term_is_found(mono):
     assert examine(case, (quick, quick)).word == WRONG
 
 
-@pytest.mark.parametrize(("gains", "word"), [((0.9, 0.96, 1.0), RIGHT), ((0.9, 0.9, 0.9), WRONG), ((1.0,), RIGHT)])
+@pytest.mark.parametrize(("gains", "word"), [
+    ((1.0,), RIGHT), ((0.9, 1.0), RIGHT), ((0.9, 0.95, 1.0), RIGHT), ((0.9, 0.9, 0.9), WRONG),
+    ((0.9, 0.95, 0.965), WRONG),  # within its errors, but no longer going away
+])  # fmt: skip
 def test_what_goes_away_with_the_step_is_the_differences(monkeypatch, gains, word):
     def look(motion, case, effort, finer=1.0) -> Look:
         found = gains[steps.index(finer)]
-        return Look(Gain(found, 0.003, 0.003, 1.0, 0.01), 0.0, verdict.TOLERANCE, True, np.ones(1), np.ones(1))
+        return Look(Gain(found, 0.003, 0.003, 1.0, 0.01), 0.0, verdict.TOLERANCE, True, np.full(1, found), np.ones(1))
 
     steps = [verdict.FINER**i for i in range(3)]
     monkeypatch.setattr(verdict, "compare", look)
     monkeypatch.setattr(verdict, "motion_of", lambda case: None)
-    monkeypatch.setattr(verdict, "_estimate", lambda *_: SimpleNamespace(add=lambda count: None))
+    monkeypatch.setattr(verdict, "estimate_of", lambda *_: SimpleNamespace(add=lambda count: None))
     monkeypatch.setattr(verdict, "asymmetry", lambda *_: 0.0)
     assert examine({}).word == word

@@ -1,10 +1,10 @@
-"""Is the derivative of a case right? Against central differences, at five standard errors, in two looks.
+"""Is the derivative of a case right? Against central differences, at five standard errors, in up to three looks.
 
 The first look is cheap. What it suspects is looked at again with independent seeds, more of them, and a smaller step,
-and once more with a still smaller one. Only what is off then, too, counts: a hundred seeds with some forty comparisons
-each give no false alarm, nor does what differences leave out between their steps. Where the image has a kink at the
-scene as it is (surfaces that touch, a corner that appears), the differences to either side disagree however small the
-step is: there is no derivative to be wrong about.
+and once more with a still smaller one, at which what was off must have shrunk, too. Only what is off then counts: a
+hundred seeds with some forty comparisons each give no false alarm, nor does what differences leave out between their
+steps. Where the image has a kink at the scene as it is (surfaces that touch, a corner that appears), the differences to
+either side disagree however small the step is: there is no derivative to be wrong about.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ BLOCK = 4  # [px]
 KNOWN_ENOUGH = 0.1  # standard error of a gain that could still tell half of the derivative from all of it
 GROUPS = 32  # of seeds, from whose scatter errors are measured
 FINER = 3.0  # by how much each further look's step is smaller
+STEP_SHARE = 0.5  # of what was off, at most left by a third look that believes the step to be the cause
 KINK_SHARE = 0.5  # of the differences' asymmetry that a smaller step must leave; that of a smooth image goes with it
 
 
@@ -78,6 +79,11 @@ class Look:
         seen = self.slope.has_signal and self.slope.stderr < KNOWN_ENOUGH
         return not seen and bool(self.estimate.any() or self.reference.any())
 
+    @property
+    def off(self) -> float:
+        """The largest difference of a block."""
+        return float(np.abs(self.estimate - self.reference).max())
+
     def __str__(self) -> str:
         return f"gain {self.slope.value:.3f} +- {self.slope.stderr:.3f}, largest |z| of blocks {self.largest_z:.1f}"
 
@@ -105,7 +111,7 @@ def _examine(case: Mapping[str, Any], first: Effort, *others: Effort) -> tuple[s
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UnsupportedWarning)
         try:
-            _estimate(motion, case, first).add(1)
+            estimate_of(motion, case, first).add(1)
         except PsdrError as error:
             return REFUSED, str(error)
         missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
@@ -114,12 +120,12 @@ def _examine(case: Mapping[str, Any], first: Effort, *others: Effort) -> tuple[s
         look = compare(motion, case, first)
     if not look.wrong:
         return (NOISY if look.blind else RIGHT), str(look)
-    before = str(look)
+    before, suspected = str(look), np.inf
     for number, effort in enumerate(others, 1):
         look = compare(motion, case, effort, FINER**number)
-        if not look.wrong:
+        if not look.wrong and look.off < STEP_SHARE * suspected:
             return RIGHT, f"{look}, after {before}"
-        before = f"{look}, after {before}"
+        before, suspected = f"{look}, after {before}", look.off
     share = asymmetry(motion, case, others[0])
     word = KINK if share > KINK_SHARE else WRONG
     return word, f"{before}; a smaller step leaves {share:.2f} of the differences' asymmetry"
@@ -131,7 +137,7 @@ def motion_of(case: Mapping[str, Any]) -> Perturbation:
 
 def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer: float = 1.0) -> Look:
     """Derivative and differences of `motion`, by independent seeds."""
-    estimate = _estimate(motion, case, effort)
+    estimate = estimate_of(motion, case, effort)
     reference = _differences(motion, case, effort, finer)
     for sampler in (estimate, reference):
         sampler.add(effort.seeds)
@@ -153,7 +159,7 @@ def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer
     return Look(gain(d, *halves), z, TOLERANCE, estimate.not_finite == 0, *blocks)
 
 
-def _estimate(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> DerivativeSampler:
+def estimate_of(motion: Perturbation, case: Mapping[str, Any], effort: Effort) -> DerivativeSampler:
     """Nothing is rendered yet."""
     integrator = integrator_specs.build(case["integrator"])
     return DerivativeSampler(motion, integrator, 0, effort.spp, groups=GROUPS, first_seed=effort.first_seed)
