@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,7 @@ from .film_cover import EdgeOnFilm, straight_cover
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import VISIBILITY_EPSILON, clearance, face_sides
+from .points import VISIBILITY_EPSILON, clearance, face_sides, step_past_lift
 from .rows import EdgeRows, face_uv
 from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
@@ -95,7 +95,8 @@ class MeshEdges(BetweenFaces):
         """Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than
         any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp) (`face_sides`); two faces
         on the same side are a silhouette, of which the one nearer to the viewer is seen. A face seen edge-on is on
-        neither side: the other face, if there is one, then ends at a silhouette.
+        neither side: the other face, if there is one, then ends at a silhouette. What silhouettes hide is looked at
+        clear of where Mitsuba starts rays (`step_past_lift`).
         """
         rows = dr.gather(EdgeRows, self.rows, row, active)
         τ = dr.normalize(rows.p1 - rows.p0)
@@ -110,7 +111,9 @@ class MeshEdges(BetweenFaces):
         use1 = on1 & (~on0 | nearer1)
         face = (on0 | on1) & ~rows.traced
         pi = self._face(rows, use1, sight, face & active)
-        beside = sight.beside(which)
+        past = step_past_lift(sight.at.x, sight.offset, sight.r)
+        outline = silhouette & ~rows.traced
+        beside = replace(sight, offset=dr.select(outline, past, sight.offset)).beside(which)
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from benchmarks import meshes
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.low_discrepancy import lane_sampler
 from psdr_jit.derivative import integrator_specs
@@ -77,8 +78,8 @@ def lines(kind: EdgeKind, row: mi.UInt32, t: mi.Float, rng):
     return kind.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), mi.Bool(True)), ω
 
 
-def rows_of(kind: EdgeKind, seed: int = 1):
-    rng = lane_sampler(mi.UInt32(seed), dr.arange(mi.UInt32, COUNT))
+def rows_of(kind: EdgeKind, seed: int = 1, count: int = COUNT):
+    rng = lane_sampler(mi.UInt32(seed), dr.arange(mi.UInt32, count))
     row = mi.UInt32(rng.next_1d() * kind.count)
     return row, rng.next_1d(), rng
 
@@ -191,22 +192,50 @@ def test_directions_of_fixed_edges_have_the_density_they_say(found):
         assert agree.mean() > 0.99  # rounding may put a sample on the other side of a wedge's border
 
 
-def test_rays_from_what_an_outline_hides_start_outside_of_the_shape(llvm):
-    """Also close to where a wall cuts into it: Mitsuba lifts their starts, towards the shape."""
+def cut_ball(ball, places: str, base: type) -> tuple[mi.Scene, EdgeKind]:
+    """A ball about the origin that a wall cuts into, and its outlines."""
     T = mi.ScalarTransform4f
-    ball = {"type": "sphere", "radius": RADIUS}
     wall = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 20).translate([0, 0, -0.9 * RADIUS]).scale(3)}
     sensor = {"type": "perspective", "to_world": T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])}
     scene = mi.load_dict({"type": "scene", "ball": ball, "wall": wall, "light": {"type": "constant"}, "sensor": sensor,
                           "integrator": {"type": "psdr_path", "max_depth": 2, "sppc": 1}})  # fmt: skip
-    with also_enabled(scene, ["ball.to_world"]):
+    with also_enabled(scene, [f"ball.{places}"]):
         job = prepare(scene.integrator().call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]
-        (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, AnalyticCurves))
+        (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, base))
+    return scene, kind
+
+
+def starts_behind(scene: mi.Scene, side, active) -> np.ndarray:
+    """Distance from the origin at which rays start from what `side` meets on the wall's front (N,)."""
+    si = scene.ray_intersect(side.ray, active)
+    met = np.array(si.is_valid() & (dr.dot(si.n, side.ray.d) < 0))
+    return np.array(dr.norm(si.spawn_ray(si.n).o))[met]
+
+
+def test_rays_from_what_an_outline_hides_start_outside_of_the_shape(llvm):
+    """Also close to where a wall cuts into it: Mitsuba lifts their starts, towards the shape."""
+    scene, kind = cut_ball({"type": "sphere", "radius": RADIUS}, "to_world", AnalyticCurves)
     row, t, rng = rows_of(kind)
     on, ω = lines(kind, row, t, rng)
     sight = Sight.of(on, row, t, ω, mi.Float(DISTANCE), on.across(ω)[0])
-    side = kind.side(row, sight, mi.UInt32(1), on.valid)
-    si = scene.ray_intersect(side.ray, on.valid)
-    met = np.array(si.is_valid() & (dr.dot(si.n, side.ray.d) < 0))
-    start = np.array(dr.norm(si.spawn_ray(si.n).o))[met]
-    assert met.sum() > COUNT / 100 and (start > RADIUS).all()
+    start = starts_behind(scene, kind.side(row, sight, mi.UInt32(1), on.valid), on.valid)
+    assert len(start) > COUNT / 100 and (start > RADIUS).all()
+
+
+def test_rays_from_what_a_fine_mesh_hides_start_outside_of_it(llvm):
+    segments, count = 128, 1 << 17
+    points, faces = meshes.ball(segments, 2 * segments)
+    ball = mi.Mesh("ball", len(points), len(faces))
+    params = mi.traverse(ball)
+    params["vertex_positions"] = (RADIUS / meshes.RADIUS * (points - meshes.CENTRE)).ravel().astype(np.float32)
+    params["faces"] = faces.ravel().astype(np.uint32)
+    params.update()
+    scene, kind = cut_ball(ball, "vertex_positions", MeshEdges)
+    row, t, rng = rows_of(kind, count=count)
+    ω, pdf = kind.wedges(row, Use.STEP, mi.Bool(True)).sample(rng.next_2d())
+    on = kind.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), pdf > 0)
+    sight = Sight.of(on, row, t, ω, mi.Float(DISTANCE), on.across(ω)[0])
+    sides = [kind.side(row, sight, mi.UInt32(which), on.valid) for which in (0, 1)]
+    start = np.concatenate([starts_behind(scene, side, on.valid & side.traced & side.differs) for side in sides])
+    inside = RADIUS * np.cos(np.pi / (2 * segments)) ** 2  # where the facets are nearest to the centre
+    assert len(start) > count / 100 and (start > inside).all()
