@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import inverse_tables, planning_tables, rows, sentences, tables
+from benchmarks import inverse_tables, planning_tables, rows, sentences, survey_tables, tables
 from psdr_jit.scene.capabilities import support_table
 
 README = rows.ROOT / "README.md"
@@ -56,12 +56,14 @@ WHAT_IS_WHAT = (
 
 
 def readme_charts(found: list[dict[str, Any]]) -> str:
-    """What the main README shows: three charts, what each says, and where that was measured."""
+    """What the main README shows: three charts, what each says, other scenes, and where all that was measured."""
     of = grouped(found)
     makers = {"accuracy": sentences.accuracy, "stability": sentences.stability, "cost": sentences.cost}
     blocks = [f"{pictures(rows.RESULTS, f'{name}.png', at='benchmarks/results/')}\n{make(of[name])}"
               for name, make in makers.items() if of.get(name)]  # fmt: skip
-    shown = [row for name in makers for row in of.get(name, ())]
+    if of.get("public_scenes"):
+        blocks.append(survey_tables.sentence(of["public_scenes"]))
+    shown = [row for name in (*makers, "public_scenes") for row in of.get(name, ())]
     return "\n\n".join(blocks) + "\n" + sentences.machines(shown) if blocks else EMPTY
 
 
@@ -77,7 +79,7 @@ def sections(of: dict[str, list[dict[str, Any]]], folder: Path) -> list[tuple[st
     """`(title, rows it draws on, its parts)` of the README of a folder of results."""
     measured, planned, inverse = of.get("accuracy", []), of.get("planning", []), of.get("inverse", [])
     swept, costs, passes = of.get("stability", []), of.get("cost", []), of.get("backward_cost", [])
-    lines = tables.summary(measured)
+    lines, public = tables.summary(measured), of.get("public_scenes", [])
 
     def shown(*names: str) -> str:
         return pictures(folder, *names)
@@ -99,6 +101,8 @@ def sections(of: dict[str, list[dict[str, Any]]], folder: Path) -> list[tuple[st
         ("Workers", of.get("scaling"), lambda: (SCALING, scaling_table(of["scaling"]))),
         ("Checks against finite differences", of.get("checks"), lambda: (check_table(of["checks"]),)),
         ("Convergence", of.get("convergence"), lambda: (convergence_table(of["convergence"]),)),
+        ("Scenes by others, every row", public, lambda: (
+            survey_tables.sentence(public), survey_tables.undecided_words(public), survey_tables.table(public))),
         ("References, every row", of.get("references"), lambda: (
             tables.reference_table(of["references"], measured),)),
         ("Accuracy against speed, every row", measured, lambda: (tables.accuracy_table(measured),)),

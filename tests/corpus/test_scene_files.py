@@ -11,8 +11,8 @@ import os
 from pathlib import Path
 
 import pytest
-from corpus.survey import NOT_FINITE, REFUSED, WRONG, Row, movable, shrunk, survey, table
 
+from benchmarks.survey import NOT_FINITE, REFUSED, WRONG, Row, movable, shrunk, survey, table
 from psdr_jit.scene import io as scene_io
 
 OWN = Path(__file__).parent / "scenes"
