@@ -31,7 +31,9 @@ COMPUTED, UNDECIDED, WARNED, REFUSED, WRONG, NOT_FINITE = (
 SIDE = 24  # longer side of the image [px]
 DEPTH = 3  # of paths, at most
 LOOK_SPP = 4  # of the derivative that tells whether there is one
-DIRECTION, AXIS = (0.6, 0.3, -0.5), (0.2, 1, 0.3)  # of motions
+DIRECTIONS = ((0.6, 0.3, -0.5), (1, 0, 0), (0, 1, 0), (0, 0, 1))  # of motions, in the order in which they are tried
+AXIS = (0.2, 1, 0.3)  # of turns
+PARTS = "flush contact"  # what warnings of motions that part things say
 TOLERANCE = 0.05  # of the gain: a few seconds of a noisy scene know no better
 
 
@@ -44,6 +46,7 @@ class Row:
     stderr: float | None
     reason: str
     seconds: float
+    motion: str = ""  # empty: none was tried to the end
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -99,40 +102,79 @@ def movable(scene: mi.Scene) -> list[ParamInfo]:
 
 
 def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
-    """Move one thing, and compare if there are seconds for it."""
+    """Move one thing, and compare if there are seconds for it.
+
+    Along the first of `DIRECTIONS` that parts nothing that touches, if there is one: where things touch, a derivative
+    to one side differs from that to the other, and no difference knows which.
+    """
     start = time.perf_counter()
 
-    def row(word: str, reason: str = "", gain: float | None = None, stderr: float | None = None) -> Row:
-        return Row(file, info.name, word, gain, stderr, reason, time.perf_counter() - start)
+    def row(word: str, reason: str = "", gain: float | None = None, stderr: float | None = None, motion="") -> Row:
+        return Row(file, info.name, word, gain, stderr, reason, time.perf_counter() - start, motion)
 
-    turned = info.kind == "emitter" and info.name.endswith("to_world")  # the sky and the sun are nowhere
-    how = {"rotate": AXIS} if turned else {"direction": DIRECTION}
+    looks: list[_Look] = []
+    for how in _motions(info):
+        try:
+            looks.append(_look(scene, info.name, how))
+        except PsdrError as error:
+            return row(REFUSED, str(error))
+        if looks[-1].not_finite:
+            return row(NOT_FINITE, f"{looks[-1].not_finite} samples or pixels were not finite")
+        if not looks[-1].parts:
+            break
+    look = looks[-1] if not looks[-1].parts else looks[0]
+    if look.warnings:
+        return row(WARNED, look.warnings[0])
+    if seconds == 0:
+        return row(COMPUTED)
+    check = psdr_jit.check_gradient(scene, info.name, **look.how, integrator=look.integrator, max_seconds=seconds,
+                                    tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
+    verdict = check.verdict
+    rejected = integrator_specs.rejected(look.integrator)
+    if rejected or not np.isfinite(check.estimate).all():
+        return row(NOT_FINITE, f"{rejected} samples were not finite")
+    word = {PASS: COMPUTED, FAIL: WRONG}.get(verdict.verdict, UNDECIDED)
+    gain, stderr = (x if np.isfinite(x) else None for x in (verdict.gain, verdict.gain_stderr))
+    return row(word, verdict.reason, gain, stderr, check.direction)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A derivative of few samples, and what was said about it."""
+
+    how: dict[str, Any]  # keywords of `perturb`
+    integrator: Any  # of its own: an integrator warns once
+    warnings: tuple[str, ...]
+    not_finite: int  # samples, and pixels
+
+    @property
+    def parts(self) -> bool:
+        """Does the motion part what touches?"""
+        return any(PARTS in text for text in self.warnings)
+
+
+def _motions(info: ParamInfo) -> list[dict[str, Any]]:
+    """How a thing is moved: lights that are nowhere are turned."""
+    turned = info.kind == "emitter" and info.name.endswith("to_world")
+    return [{"rotate": AXIS}] if turned else [{"direction": direction} for direction in DIRECTIONS]
+
+
+def _integrator(scene: mi.Scene) -> Any:
     spec = integrator_specs.integrator_spec(scene, "psdr_path")
     depth = spec.get("max_depth", -1)
     spec["max_depth"] = DEPTH if depth < 0 else min(depth, DEPTH)
-    integrator = integrator_specs.build(spec)
+    return integrator_specs.build(spec)
+
+
+def _look(scene: mi.Scene, param: str, how: dict[str, Any]) -> _Look:
+    integrator = _integrator(scene)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        try:
-            look = DerivativeSampler(perturb(scene, info.name, **how), integrator, 0, LOOK_SPP)
-            look.add(1)
-        except PsdrError as error:
-            return row(REFUSED, str(error))
-    missing = [str(w.message) for w in said if issubclass(w.category, UnsupportedWarning)]
-    if look.not_finite or not np.isfinite(look.images.mean()).all():
-        return row(NOT_FINITE, f"{look.not_finite} samples were not finite")
-    if missing:
-        return row(WARNED, missing[0])
-    if seconds == 0:
-        return row(COMPUTED)
-    check = psdr_jit.check_gradient(scene, info.name, **how, integrator=integrator, max_seconds=seconds,
-                                    tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
-    verdict = check.verdict
-    if integrator_specs.rejected(integrator) or not np.isfinite(check.estimate).all():
-        return row(NOT_FINITE, f"{integrator_specs.rejected(integrator)} samples were not finite")
-    word = {PASS: COMPUTED, FAIL: WRONG}.get(verdict.verdict, UNDECIDED)
-    gain, stderr = (x if np.isfinite(x) else None for x in (verdict.gain, verdict.gain_stderr))
-    return row(word, verdict.reason, gain, stderr)
+        sampler = DerivativeSampler(perturb(scene, param, **how), integrator, 0, LOOK_SPP)
+        sampler.add(1)
+    missing = tuple(str(w.message) for w in said if issubclass(w.category, UnsupportedWarning))
+    pixels = int(np.sum(~np.isfinite(sampler.images.mean())))
+    return _Look(how, integrator, missing, sampler.not_finite + pixels)
 
 
 def table(rows: list[Row]) -> str:
