@@ -6,7 +6,9 @@ The step from that dark fringe to the lit face moves by itself: it is an edge of
 
 from __future__ import annotations
 
+import re
 import warnings
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -172,11 +174,14 @@ TWO_SIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
 
 
 @pytest.mark.parametrize("mesh, children, named", [
-    (coarse_cube, LIGHT, True), (coarse_cube, MIRROR, True), (coarse_cube, REFLECTOR, False),
-    (coarse_cube, TWO_SIDED, True), (lambda **children: sphere(16, **children), MIRROR, False),
-], ids=["light", "mirror", "reflector", "two sides", "fine"])  # fmt: skip
+    (coarse_cube, LIGHT, 20), (coarse_cube, MIRROR, 35), (coarse_cube, REFLECTOR, None), (coarse_cube, TWO_SIDED, 35),
+    (partial(sphere, 16), MIRROR, None), (partial(sphere, 8), LIGHT, 20), (partial(sphere, 24), LIGHT, None),
+], ids=["light", "mirror", "reflector", "two sides", "fine", "coarse light", "fine light"])  # fmt: skip
 def test_normals_far_off_their_faces_are_named(llvm, mesh, children, named):
-    """Where a face's plane cuts what it mirrors is neither an edge nor a horizon, nor is what gets inside."""
+    """Where a face's plane cuts what it mirrors is neither an edge nor a horizon, nor is what gets inside.
+
+    Lights are sampled by their interpolated normals: a ball of eight segments that turns in place had a gain of 0.05.
+    """
     lamp = {"type": "rectangle", "emitter": {"type": "area"}}
     mesh = mesh(**children)
     mesh.set_id("shape")
@@ -184,4 +189,5 @@ def test_normals_far_off_their_faces_are_named(llvm, mesh, children, named):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         make_plan(scene, "shape.vertex_positions", integrator={"type": "psdr_path", "form": "spatial", "sppc": 1})
-    assert any("35 degrees off" in str(w.message) for w in caught) == named
+    degrees = [re.search(r"more than (\d+) degrees off", str(w.message)) for w in caught]
+    assert [int(found[1]) for found in degrees if found] == ([] if named is None else [named])
