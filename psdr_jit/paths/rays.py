@@ -12,6 +12,9 @@ from .tube_surface import surface_at
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
 
+#: What is added to its length for the rounding of float32, relative to the coordinates: eight units in the last place.
+ROUNDING = 1e-6
+
 
 def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
     """Is the emitter sample visible from `si`? Any-hit ray; returns `(hit, visible)` with an empty hit."""
@@ -22,13 +25,16 @@ def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSa
 def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
     """The same with a closest-hit ray, which also tells *which* point of an area light was reached.
 
-    With it the light's own motion can be attached later without another ray. Returns `(hit, visible)`.
+    With it the light's own motion can be attached later without another ray. Returns `(hit, visible)`. All lengths are
+    those of the ray, which Mitsuba starts above the surface: of light from nearby, that height is a good part.
     """
     ray = si.spawn_ray_to(ds.p)
     on_surface = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
-    ray.maxt = dr.select(on_surface, ds.dist * (1 + SHADOW_EPSILON), ray.maxt)
+    dist = dr.norm(ds.p - ray.o)
+    slack = SHADOW_EPSILON * dist + ROUNDING * dr.max(dr.abs(ds.p))
+    ray.maxt = dr.select(on_surface, dist + slack, ray.maxt)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    reached = pi.is_valid() & (pi.t >= ds.dist * (1 - SHADOW_EPSILON)) & (pi.shape.emitter() == ds.emitter)
+    reached = pi.is_valid() & (pi.t >= dist - slack) & (pi.shape.emitter() == ds.emitter)
     return Hit.of(ray, pi), active & dr.select(on_surface, reached, ~pi.is_valid())
 
 

@@ -128,6 +128,25 @@ def test_lamp_over_a_plane(variant, axis):
     assert_grad_close(image, np.repeat(exact[..., None], 3, axis=2), reference_stderr=ROUNDING)
 
 
+@pytest.mark.parametrize("gap", [0.2, 0.02])
+def test_a_glowing_sphere_close_to_a_plane(variant, gap):
+    """Beneath a sphere of radius r at the distance d a diffuse plane has ρ L r²/d². Rays start a height above it."""
+    r, rho, radiance = 0.4, 0.5, 10.0
+    d = r + gap
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    grazing = T().look_at([-0.3, 0, 0.05], [0, 0, 0], [0, 0, 1]).scale([1e-3, 1e-3, 1])
+    scene = mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "camera": {"type": "orthographic", "to_world": grazing, "film": film},
+        "plane": {"type": "rectangle", "to_world": T().scale(0.05), "bsdf": {"type": "diffuse", "reflectance": rho}},
+        "lamp": {"type": "sphere", "center": [0, 0, d], "radius": r, "emitter": {"type": "area", "radiance": radiance}},
+    }, optimize=False)  # fmt: skip
+    image = estimate(scene, "lamp.to_world", spp=2048, direction=(0, 0, 1))
+    assert_grad_close(image, np.full(image.shape[1:], -2 * rho * radiance * r**2 / d**3), reference_stderr=2 * ROUNDING)
+
+
 @pytest.mark.parametrize("param, derivative", [
     ("walls.bsdf.reflectance.value", lambda E, a: E / (1 - a) ** 2),
     ("walls.emitter.radiance.value", lambda E, a: 1 / (1 - a)),
