@@ -48,9 +48,9 @@ def test_scenes_take_turns(tmp_path):
         (tmp_path / name).touch()
     corpus = Corpus([tmp_path], 2, (0, 1))
     corpus.moved = dict(zip([tmp_path / name for name in files], (["a", "b"], [], ["c"]), strict=True))
-    assert [(Path(name).name, param) for name, _, param in corpus.pairs()] == [
-        ("one.xml", "a"), ("two.xml", "c"), ("one.xml", "b"),
-    ]  # fmt: skip
+    pairs = [(Path(name).name, param) for name, _, param in corpus.pairs()]
+    assert {name for name, _ in pairs[:2]} == {"one.xml", "two.xml"} and pairs[2][0] == "one.xml"
+    assert sorted(param for _, param in pairs) == ["a", "b", "c"]
     halves = [[name for name, _ in Corpus([tmp_path], 2, (k, 2)).files()] for k in range(2)]
     assert [len(half) for half in halves] == [2, 1] and not set(halves[0]) & set(halves[1])
 
