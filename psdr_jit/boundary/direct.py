@@ -62,9 +62,6 @@ NAME = "direct"
 #: are drawn as make about one path per sample.
 LINES_PER_PATH_UNDER_SKY = 2
 
-#: Slope of an emitter, seen from an edge, that the search for its point allows for.
-STEEPEST = 20.0
-
 #: Share of the height at which rays start that is left out above a surface which one looks for from there.
 INSIDE = 0.02
 
@@ -130,9 +127,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     up.maxt = dr.select(on_surface, dr.inf, light.dist - on.lead)
     pi = scene.ray_intersect_preliminary(up, coherent=False, active=active)
     reached = pi.is_valid() & (pi.shape.emitter() == light.emitter)
-    # Not another sheet of the emitter; a step to the side changes the distance to a slanted one.
-    slack = SHADOW_EPSILON * light.dist + STEEPEST * on.offset
-    reached &= dr.abs(pi.t + on.lead - light.dist) < slack
+    reached &= dr.abs(pi.t + on.lead - light.dist) < SHADOW_EPSILON * light.dist  # not another sheet of the emitter
     active &= dr.select(on_surface, reached, ~pi.is_valid())
 
     # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.
