@@ -5,12 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..paths.rays import ROUNDING
+
 #: Sideways distance at which a ray that passes an edge is traced, relative to the distance from the scene's centre: far
 #: below anything one can see.
 SIDE_OFFSET = 1e-5
-
-#: What is added for the rounding of float32 positions, relative to the coordinates: eight units in the last place.
-ROUNDING = 1e-6
 
 #: The side rays start this many side offsets in front of the edge: an edge that rests on another surface is then
 #: seen against that surface, and the ray does not start beneath it.

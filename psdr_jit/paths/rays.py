@@ -12,7 +12,7 @@ from .tube_surface import surface_at
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
 
-#: What is added to its length for the rounding of float32, relative to the coordinates: eight units in the last place.
+#: What is added for the rounding of float32 positions, relative to the coordinates: eight units in the last place.
 ROUNDING = 1e-6
 
 
