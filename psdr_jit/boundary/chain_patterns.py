@@ -1,8 +1,11 @@
-"""Steps inside surfaces that chains meet: checkerboards, texel borders, slopes of bump maps, faces of one colour each.
+"""Steps inside surfaces that chains meet: checkerboards, texel borders, slopes of bump maps, faces of one colour each,
+seams of meshes.
 
 A family of lines a·(u, v) + b = k (`scene/patterns.py`) divides a surface into cells ⌊a·(u, v) + b⌋. Two chains that
 end in different cells have crossed a line, on which F = a·(u, v) + b − k = 0; where the texture coordinates of a round
-shape start anew, F is the distance from there. Attributes by face step along the edges of a mesh.
+shape start anew, F is the distance from there. Attributes by face step along the edges of a mesh, and what is stored by
+vertex along some of them: they divide the mesh into charts, and two chains that end in different ones have crossed an
+edge.
 """
 
 from __future__ import annotations
@@ -15,8 +18,11 @@ import numpy as np
 
 from ..core.upload import uploaded
 from ..edges.scene_patterns import steps_of
+from ..edges.seams import charts
+from ..edges.segments import known_topology
 from ..plan.job import Job
 from ..plan.probe_motion import registry_table
+from ..scene.facts import ShapeFacts
 
 #: Number of no family.
 NO_FAMILY = 0
@@ -49,16 +55,18 @@ class ChainPatterns:
     start: mi.UInt32  # by registry index of a shape: number of its first family
     count: mi.UInt32  # and how many it has
     most: int
-    by_face: mi.UInt32  # by registry index: 1 if the faces differ
+    charted: mi.UInt32  # by registry index: number of the first face in `chart`, 0: no edges are steps
+    chart: mi.UInt32  # by face; number 0 is none
     seam: mi.UInt32  # by registry index: the texture coordinate that starts anew, plus 1; 0: none does
 
     @staticmethod
     def of(job: Job) -> ChainPatterns | None:
         """None if nothing steps."""
-        chosen = [s for s in job.facts.shapes if s.patterns and s.index >= 0]
-        if not chosen:
+        shapes = [s for s in job.facts.shapes if s.index >= 0]
+        found = [steps_of(job, s) if s.patterns else ([], False) for s in shapes]
+        parts = [_charts(job, s, between_faces) for s, (_, between_faces) in zip(shapes, found, strict=True)]
+        if not any(families for families, _ in found) and all(part is None for part in parts):
             return None
-        found = [steps_of(job, facts) for facts in chosen]
         columns, start, count = [(0.0, 0.0, 0.0, 0.0, 0.0)], [], []
         for families, _ in found:
             start.append(len(columns))
@@ -67,15 +75,17 @@ class ChainPatterns:
         a0, a1, b, first, last = (uploaded(mi.Float, np.array(column)) for column in zip(*columns, strict=True))
 
         def by_registry(values: list[int]) -> mi.UInt32:
-            tables = (registry_table(job.scene, {s.index}) * v for s, v in zip(chosen, values, strict=True))
+            tables = (registry_table(job.scene, {s.index}) * v for s, v in zip(shapes, values, strict=True) if v)
             return sum(tables, registry_table(job.scene, set()))
 
-        faces = [int(between_faces) for _, between_faces in found]
-        seams = [SEAMS.get(s.plugin, 0) for s in chosen]
+        widths = [0 if part is None else len(part) for part in parts]
+        faces = [1 + sum(widths[:i]) if width else 0 for i, width in enumerate(widths)]
+        chart = uploaded(mi.UInt32, np.concatenate([[0], *(part for part in parts if part is not None)]))
+        seams = [SEAMS.get(s.plugin, 0) if s.patterns else 0 for s in shapes]
         families = Family(mi.Vector2f(a0, a1), b, first, last)
         tables = [by_registry(values) for values in (start, count, faces, seams)]
-        dr.eval(families, tables)
-        return ChainPatterns(families, tables[0], tables[1], max(count), tables[2], tables[3])
+        dr.eval(families, tables, chart)
+        return ChainPatterns(families, tables[0], tables[1], max(count), tables[2], chart, tables[3])
 
     def crossed(self, a, b, active: mi.Bool) -> tuple[mi.Bool, mi.UInt32, mi.Float]:
         """`(has one been, its family, where)` between two hits of one surface; no family: it was an edge between faces.
@@ -84,7 +94,10 @@ class ChainPatterns:
         """
         shape = dr.select(active, dr.reinterpret_array(mi.UInt32, a.shape), 0)
         start, count = dr.gather(mi.UInt32, self.start, shape), dr.gather(mi.UInt32, self.count, shape)
-        differs = active & (dr.gather(mi.UInt32, self.by_face, shape) != 0) & (a.prim_index != b.prim_index)
+        first = dr.gather(mi.UInt32, self.charted, shape)
+        charted = active & (first != 0)
+        chart_a, chart_b = (dr.gather(mi.UInt32, self.chart, first + end.prim_index, charted) for end in (a, b))
+        differs = charted & (chart_a != chart_b)
         number, where = mi.UInt32(NO_FAMILY), mi.Float(0.5)
         for i in range(self.most):
             family = self.family(start + i, active & (i < count))
@@ -120,3 +133,14 @@ SEAMS = {"sphere": 1, "cylinder": 1, "disk": 2}
 
 #: Numbers of lines are floats: no line lies beyond this one.
 LARGEST = 2.0**24
+
+
+def _charts(job: Job, facts: ShapeFacts, between_faces: bool) -> np.ndarray | None:
+    """(F,) the chart of each face of a mesh; None: no edges of it are steps."""
+    if between_faces:
+        return np.arange(facts.faces)
+    if facts.kind != "mesh" or not (facts.smooth or facts.painted):
+        return None
+    mesh = job.scene.shapes()[facts.index]
+    topology = known_topology(mesh, job.call.memory)
+    return charts(mesh, facts.painted, (topology.host, topology.device), job.call.memory)

@@ -31,7 +31,7 @@ from ..plan.term import Term
 from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
-from ..scene.shared_texcoords import warn_about_shared_texcoords
+from ..scene.painted_lights import warn_about_painted_lights
 from ..scene.stale_normals import warn_about_stale_normals
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
@@ -97,7 +97,7 @@ def prepare(call: Call) -> Prepared:
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
     require_supported(facts, call.memory)
-    warn_about_shared_texcoords(call.scene, facts, call.memory)
+    warn_about_painted_lights(call.scene, facts, call.memory)
     if call.options.hide_emitters:
         warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":

@@ -22,7 +22,8 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from .contacts import Contact
 from .intersections import TriangleMesh
-from .segments import EdgeSet, is_smooth
+from .seams import is_smooth
+from .segments import EdgeSet
 from .solids import Ball, Solid, triangles
 from .topology import INVALID
 

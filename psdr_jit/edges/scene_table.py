@@ -51,8 +51,9 @@ from .table import EdgeTable
 #: Of one render call: the table.
 TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
 
-#: Of an integrator: the arrays that straight edges were made from last, which meshes could move, and these edges.
-STRAIGHT: Slot[tuple[list, list[bool], EdgeSet] | None] = Slot(lambda: None)
+#: Of an integrator: the arrays that straight edges were made from last, which meshes could move and which were
+#: painted, and these edges.
+STRAIGHT: Slot[tuple[list, tuple[list[bool], list[bool]], EdgeSet] | None] = Slot(lambda: None)
 
 #: Values along an axis of a grid from which the band along outlines, in which blended normals turn away, is narrow.
 FINE = 48
@@ -122,15 +123,16 @@ def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
     """Edges of the meshes; kept from call to call while these stay as they are: views of one scene share them."""
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
-    moving = [s.moves for s in meshes]
+    moving, painted = [s.moves for s in meshes], [s.painted for s in meshes]
     seams = [None if p is None else p.on_sides for p in patterns_of(job, meshes)]
     if balls or not job.plan.prunes:
-        return edge_set(shapes, moving, job.call.memory, balls, seams)
+        return edge_set(shapes, moving, job.call.memory, balls, seams, painted)
     buffers = [dr.detach(buffer) for shape in shapes for buffer in mesh_buffers(shape)]
     buffers += [on_sides for on_sides in seams if on_sides is not None]
     known = job.call.memory[STRAIGHT]
-    if known is None or known[1] != moving or not same_arrays(known[0], buffers):
-        known = (buffers, moving, edge_set(shapes, moving, job.call.memory, seams=seams))
+    if known is None or known[1] != (moving, painted) or not same_arrays(known[0], buffers):
+        straight = edge_set(shapes, moving, job.call.memory, seams=seams, painted=painted)
+        known = (buffers, (moving, painted), straight)
         job.call.memory[STRAIGHT] = known
     return replace(known[2], meshes=tuple(shapes))
 

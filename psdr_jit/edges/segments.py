@@ -25,15 +25,13 @@ from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .junctions import JunctionTable, find_junctions
 from .parts import Part, parts_of
 from .rows import EdgeRows, concatenate
+from .seams import corner_vertex, is_smooth, split_seams
 from .shells import edge_shells
 from .solids import Ball, Solid
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
-
-#: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
-SEAM_TOLERANCE = 1e-4
 
 
 @dataclass
@@ -71,13 +69,14 @@ def edge_set(
     memory: Memory,
     balls: tuple[Ball, ...] = (),
     seams: list[mi.Bool | None] | None = None,
+    painted: list[bool] | None = None,
 ) -> EdgeSet:
     """Edges of `meshes` in their present state; topologies are kept in `memory` from call to call.
 
     Intersection curves of meshes with each other and with `balls` have rows of their own. Coinciding edges of shapes
     that all move, or all rest (`moving`), become one row, whole edges or parts of them: `coinciding`.
     `seams`: by mesh, the sides of faces along which a pattern steps, 3 · face + opposite corner; None for meshes
-    without.
+    without. `painted`: by mesh, does a texture look something up on it? None: on any may one.
     Raises `SceneError` for empty meshes and non-finite vertices.
     """
     if not meshes:
@@ -88,7 +87,7 @@ def edge_set(
         faces = mesh_faces(mesh)
         dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
         topology = _cached_topology(mesh, positions, faces, memory)
-        jumps = _jumps(mesh, faces, topology.device)
+        jumps = split_seams(mesh, painted is None or painted[i], topology.device)
         if seams is not None and seams[i] is not None:
             jumps |= _on_sides(seams[i], topology.device)
         parts.append(_rows(mesh, (positions, faces), topology, jumps, i, first_vertex, moving[i]))
@@ -114,8 +113,9 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
 
 
 def known_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
-    """What `edge_set` has found out about `mesh`."""
-    return memory[TOPOLOGIES][mesh.id(), mesh.vertex_count(), mesh.face_count()]
+    """What `edge_set` has found out about `mesh` in this call, or what it would."""
+    known = memory[TOPOLOGIES].get((mesh.id(), mesh.vertex_count(), mesh.face_count()))
+    return known or _cached_topology(mesh, dr.detach(mesh_positions(mesh)), mesh_faces(mesh), memory)
 
 
 def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> MeshTopology:
@@ -171,44 +171,13 @@ def _still_outward(facing: mi.Float, positions: mi.Point3f, faces: mi.Vector3u) 
     return dr.sum(facing * dr.dot(a, dr.cross(b, c))) >= 0
 
 
-def _corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:
-    tri = dr.gather(mi.Vector3u, faces, face)
-    return dr.select(corner == 0, tri.x, dr.select(corner == 1, tri.y, tri.z))
-
-
 def _welds_hold(device: EdgeTopologyDevice, positions: mi.Point3f, faces: mi.Vector3u) -> mi.Bool:
     """Do vertices that were welded still coincide? An optimiser may have pulled split vertices apart."""
-    other = dr.gather(mi.Point3f, positions, _corner_vertex(faces, device.f1, device.corner1.x))
+    other = dr.gather(mi.Point3f, positions, corner_vertex(faces, device.f1, device.corner1.x))
     own = dr.gather(mi.Point3f, positions, device.v0)
     gap = dr.max(dr.select(device.border, 0, dr.norm(other - own)))
     extent = dr.max(dr.max(positions, axis=1) - dr.min(positions, axis=1), axis=None)
     return gap <= 8 * WELD_TOLERANCE * extent
-
-
-def is_smooth(mesh: mi.Mesh) -> bool:
-    return mesh.has_vertex_normals() and not mesh.has_face_normals()
-
-
-def _jumps(mesh, faces: mi.Vector3u, topo: EdgeTopologyDevice) -> mi.Bool:
-    """Edges along which shading normals or the coordinates of a texture are split."""
-    found = dr.full(mi.Bool, False, dr.width(topo.v0))
-    ends = ((topo.v0, topo.corner1.x), (topo.v1, topo.corner1.y))
-
-    def jumps(vertex_data) -> mi.Bool:
-        jump = mi.Bool(False)
-        for vertex, corner in ends:
-            other = dr.gather(type(vertex_data), vertex_data, _corner_vertex(faces, topo.f1, corner))
-            jump |= dr.norm(other - dr.gather(type(vertex_data), vertex_data, vertex)) > SEAM_TOLERANCE
-        return topo.split & jump
-
-    if is_smooth(mesh):
-        found |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
-    bsdf = mesh.bsdf()
-    textured = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    textured |= mesh.emitter() is not None and mi.has_flag(mesh.emitter().flags(), mi.EmitterFlags.SpatiallyVarying)
-    if textured and mesh.has_vertex_texcoords():
-        found |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))
-    return found
 
 
 def _on_sides(sides: mi.Bool, topo: EdgeTopologyDevice) -> mi.Bool:

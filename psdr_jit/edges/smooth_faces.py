@@ -9,7 +9,8 @@ import mitsuba as mi
 
 from ..core.compat import mesh_faces
 from ..core.memory import Memory
-from .segments import attached_positions, is_smooth, known_topology
+from .seams import is_smooth
+from .segments import attached_positions, known_topology
 
 
 @dataclass

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from .capabilities import BENDING_PARAMETERS, SMOOTH_PARAMETERS, WEIGHED_PLUGINS
-from .graph import SceneGraph, named_children, plugin_name
+from .graph import SceneGraph, named_children, plugin_name, varies
 
 BENT_NORMALS = frozenset({"bumpmap", "normalmap"})
 
@@ -35,7 +35,7 @@ def lost_weights(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ..
     """
     if all(plugin_name(node) in WEIGHED_PLUGINS for node in graph.walk(bsdf) if isinstance(node, mi.BSDF)):
         return (), False
-    enabled, varies = {}, False
+    enabled, varying = {}, False
     for node in graph.walk(bsdf):
         if not isinstance(node, mi.BSDF) or not _has_delta_lobe(node):
             continue
@@ -46,9 +46,9 @@ def lost_weights(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[tuple[str, ..
         ]
         for child in own:
             enabled |= dict.fromkeys(graph.enabled_from(child))
-            varies |= isinstance(child, mi.Texture) and child.is_spatially_varying()
+            varying |= isinstance(child, mi.Texture) and varies(child)
         enabled |= dict.fromkeys(graph.enabled_full(node))
-    return tuple(enabled), varies
+    return tuple(enabled), varying
 
 
 def bending(graph: SceneGraph, bsdf: mi.BSDF | None) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from .capabilities import CONE_PARAMETERS, POSE_PARAMETERS, UNIFORM_EMITTERS
-from .graph import SceneGraph, jumping_textures, plugin_name, rim_of_cone
+from .graph import SceneGraph, is_painted, jumping_textures, plugin_name, rim_of_cone
 from .patterns import missing_patterns, steps_of_light
 
 
@@ -44,7 +44,7 @@ def emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: li
         shape=owners[0] if owners else -1,
         delta=bool(flags & int(mi.EmitterFlags.Delta)),
         infinite=bool(flags & int(mi.EmitterFlags.Infinite)),
-        varies=plugin not in UNIFORM_EMITTERS or bool(flags & int(mi.EmitterFlags.SpatiallyVarying)),
+        varies=plugin not in UNIFORM_EMITTERS or is_painted(graph, emitter),
         rim=rim,
         steps=steps,
         jumps=missing_patterns(jumps) if steps or (owners and plugin == "area") else jumps,

@@ -27,6 +27,7 @@ from .graph import (
     SceneGraph,
     is_black,
     is_cubic,
+    is_painted,
     is_turned_grid,
     is_unevenly_scaled,
     jumping_textures,
@@ -66,6 +67,7 @@ class ShapeFacts:
     bends: tuple[str, ...]  # enabled parameters that turn the directions of its delta lobes, full names
     delta_obstacle: str  # why directions cannot be followed through them, "" if they can
     blends_delta: bool  # a "blendbsdf" of a delta lobe and a smooth one
+    painted: bool  # a texture of its BSDF or light may differ from point to point
     patterns: tuple[str, ...]  # textures that step inside the surface, "checkerboard 'floor'", ...
     jumps: tuple[str, ...]  # whatever else is discontinuous inside the surface
     sees_frame: bool  # its BSDF depends on how the shading frame is turned about the normal
@@ -267,6 +269,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         bends=bending(graph, bsdf),
         delta_obstacle=lobes_not_followed(graph, bsdf) if delta_lobes(graph, bsdf) else "",
         blends_delta=blends_delta(graph, bsdf),
+        painted=is_painted(graph, bsdf) or is_painted(graph, shape.emitter()),
         patterns=tuple(dict.fromkeys(step for step in steps if step not in missing)),
         jumps=jumps,
         sees_frame=sees_frame(graph, bsdf),

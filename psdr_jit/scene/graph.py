@@ -169,6 +169,16 @@ def is_black(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
     return all(value is not None and not value.any() for value in values)
 
 
+def varies(texture: mi.Texture) -> bool:
+    """Whether a texture may differ from point to point. Attributes of meshes do, though Mitsuba denies it."""
+    return texture.is_spatially_varying() or plugin_name(texture) == "mesh_attribute"
+
+
+def is_painted(graph: SceneGraph, owner: mi.Object | None) -> bool:
+    """Whether a texture below `owner` may differ from point to point. Flags of BSDFs do not tell, in Mitsuba 3.9."""
+    return any(isinstance(node, mi.Texture) and varies(node) for node in graph.walk(owner, skip=(mi.Shape,)))
+
+
 def is_piecewise_constant(texture: mi.Texture, plugin: str) -> bool:
     """Whether a texture varies over the surface and yet has no derivative with respect to the position.
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .capabilities import PATTERN_PLUGINS, PATTERNS_ON_CURVES
-from .graph import child_objects, is_piecewise_constant, plugin_name
+from .graph import child_objects, is_piecewise_constant, plugin_name, varies
 
 #: Texels of a bitmap that are looked at outside of its unit square, to see how it goes on there.
 PROBES = 1024
@@ -118,7 +118,7 @@ def step_families(texture: mi.Object) -> list[StepFamily]:
 
 def _checkers(texture: mi.Texture, to_uv: np.ndarray) -> list[StepFamily]:
     colours = [child for child in child_objects(texture) if isinstance(child, mi.Texture)]
-    if not any(colour.is_spatially_varying() for colour in colours):
+    if not any(varies(colour) for colour in colours):
         two = _values(texture, _preimages(to_uv, np.array([[0.25, 0.25], [0.75, 0.25]])))
         if (two[0] == two[1]).all():
             return []

@@ -161,6 +161,63 @@ def test_faces_of_their_own_colours(llvm):
     assert_gain(scene_of(mesh), "thing.vertex_positions", MOVED)
 
 
+def patchwork(lookup: str, emits: bool = False) -> mi.Mesh:
+    """A flat sheet of 3 × 3 squares that share no vertices: each has its own place in a smooth bitmap, or own colours.
+
+    Nothing but texture coordinates (`lookup` is "bitmap") or colours (it is "vertex_color") steps between them. The
+    places do not overlap.
+    """
+    n, rng = 3, np.random.default_rng(2)
+    squares = np.stack(np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), -1).reshape(-1, 1, 2)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    flat = ((squares + corners) * 2 / n - 1).reshape(-1, 2)
+    faces = (4 * np.arange(n * n)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    smooth = {**texels(4, 4), "filter_type": "bilinear"}
+    texture = smooth if lookup == "bitmap" else {"type": "mesh_attribute", "name": lookup}
+    props, owner = mi.Properties(), painted(texture)["bsdf"]
+    if emits:
+        owner = {"type": "area", "radiance": texture}
+    props["of"] = mi.load_dict(owner)
+    mesh = mi.Mesh("thing", len(flat), len(faces), has_vertex_texcoords=True, props=props)
+    mesh.add_attribute("vertex_color", 3, rng.random(3 * len(flat)).astype(np.float32))
+    params, place = mi.traverse(mesh), rng.permutation(squares[:, 0])[:, None]
+    places = (place + 0.9 * corners) / n
+    params["vertex_positions"] = np.concatenate([flat, np.zeros((len(flat), 1))], 1).ravel().astype(np.float32)
+    params["vertex_texcoords"], params["faces"] = places.ravel().astype(np.float32), faces.ravel().astype(np.uint32)
+    params.update()
+    return mesh
+
+
+@pytest.mark.parametrize("param, how", [
+    ("thing.vertex_positions", MOVED), pytest.param("camera.to_world", {"rotate": (1, 0, 0.5)}, marks=slow),
+], ids=["moved", "camera-turned"])  # fmt: skip
+@pytest.mark.parametrize("lookup", ["vertex_color", "bitmap"])
+def test_seams_inside_a_plane(llvm, lookup, param, how):
+    assert_gain(scene_of(patchwork(lookup)), param, how, seeds=6, spp=512)
+
+
+@slow
+@pytest.mark.parametrize("form", ["spatial", "material"])
+@pytest.mark.parametrize("lookup", ["vertex_color", "bitmap"])
+def test_seams_inside_a_plane_seen_in_a_mirror(llvm, lookup, form):
+    view = {"eye": (0.3, -1.5, 1.2), "target": (0, 1.2, 0.85), "fov": 35}
+    mirror = glossy_wall() | {"bsdf": {"type": "conductor"}}
+    scene = scene_of(patchwork(lookup), **view, wall=mirror)
+    assert_gain(scene, "thing.vertex_positions", MOVED, spp=2048, max_depth=3, form=form)
+
+
+@slow
+def test_seams_inside_a_light(llvm):
+    """It is seen, and lights a floor close to it; squares do not overlap in the texture, of which Mitsuba takes one."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -0.3]).scale(3)}
+    light = patchwork("bitmap", emits=True)
+    params = mi.traverse(light)
+    params["faces"] = mi.UInt32(np.array(params["faces"]).reshape(-1, 3)[:, ::-1].ravel())  # turned towards the floor
+    params.update()
+    scene = scene_of(light, eye=(0.3, -3, 0.5), target=(0, 0, -0.3), floor=floor)
+    assert_gain(scene, "thing.vertex_positions", {"direction": (0.5, 0.3, 0.2)}, spp=2048)
+
+
 @slow
 def test_a_light_with_texels(llvm):
     light = {"type": "rectangle", "emitter": {"type": "area", "radiance": texels()}}

@@ -1,4 +1,4 @@
-"""Painted lights whose points share texture coordinates are named, and no others."""
+"""Painted lights that Mitsuba samples wrongly are named, and no others."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import pytest
 
 from psdr_jit.core.memory import Memory
 from psdr_jit.scene.facts import analyse
-from psdr_jit.scene.shared_texcoords import warn_about_shared_texcoords
+from psdr_jit.scene.painted_lights import warn_about_painted_lights
 
-PAINTED = {"type": "checkerboard"}
+PAINTED, COLOURED = {"type": "checkerboard"}, {"type": "mesh_attribute", "name": "vertex_color"}
 CASES = {"cube-painted": ("cube", PAINTED, True), "cube-plain": ("cube", 1.0, False),
+         "cube-coloured": ("cube", COLOURED, True),
          "rectangle-painted": ("rectangle", PAINTED, False), "sphere-painted": ("sphere", PAINTED, False)}  # fmt: skip
 
 
@@ -25,7 +26,7 @@ def test_who_is_named(llvm, case):
     for _ in range(2):  # the second time it is known, and has been said
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
-            warn_about_shared_texcoords(scene, analyse(scene), memory)
+            warn_about_painted_lights(scene, analyse(scene), memory)
         said.append([str(w.message) for w in found])
     assert [len(texts) for texts in said] == [int(named), 0]
     assert all("'lamp'" in text for text in said[0])

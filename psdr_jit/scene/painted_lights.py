@@ -1,8 +1,9 @@
-"""Painted area lights of which several points have the same texture coordinates.
+"""Painted area lights that Mitsuba samples wrongly: the image of `path` itself is wrong, and its derivative has no
+value to compare with.
 
 Mitsuba 3.9 chooses points of a light with a texture by their place in the texture, and takes the first point of the
-shape that it finds there for the only one. Of a `cube`, whose faces all show the whole texture, one face is sampled:
-the image of `path` itself is wrong, and its derivative has no value to compare with.
+shape that it finds there for the only one. Of a `cube`, whose faces all show the whole texture, one face is sampled.
+And what a light with an attribute of its mesh sends from a point that has been sampled is looked up without the face.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from ..core.memory import Memory, Slot, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
+from .graph import child_objects
+from .names import plugin_name
 
 #: By how much the faces may cover their part of the texture more than once, relative to its size: rounding.
 TOLERANCE = 1e-3
@@ -24,12 +27,19 @@ TOLERANCE = 1e-3
 OVERLAPS: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
 
 
-def warn_about_shared_texcoords(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
+def warn_about_painted_lights(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
     """Name painted lights whose faces, taken together, are larger than the part of the texture that they show."""
     painted = [e.shape for e in facts.emitters if e.plugin == "area" and e.varies and e.shape >= 0]
-    for shape in (facts.shapes[k] for k in painted):
-        mapped = shape.is_mesh and shape.has_texcoords and shape.index >= 0
-        if mapped and _overlap(scene.shapes()[shape.index], memory):
+    for shape in (facts.shapes[k] for k in painted if facts.shapes[k].index >= 0):
+        mesh = scene.shapes()[shape.index]
+        if any(plugin_name(texture) == "mesh_attribute" for texture in child_objects(mesh.emitter())):
+            warn_once(
+                f"the area light '{shape.name}' has the colours of a mesh attribute: Mitsuba looks them up at wrong "
+                "places where it samples the light, so that the image itself is wrong; use a bitmap",
+                UnsupportedWarning,
+                memory,
+            )
+        elif shape.is_mesh and shape.has_texcoords and _overlap(mesh, memory):
             warn_once(
                 f"the area light '{shape.name}' has a texture, and several of its points have the same texture "
                 "coordinates: Mitsuba samples one of them only, so that the image itself is wrong; give every point a "
