@@ -31,6 +31,7 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
+from ..paths.rays import ROUNDING
 from ..paths.recording import GRAZING, PathRecords
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
@@ -80,8 +81,9 @@ def material_segment(
 ):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
-    `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped the
-    direction stays as it is. `rests`: the point and |dA| are known to rest, which spares the way back to vertices.
+    `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped, or is x
+    itself, the direction stays as it is. `rests`: the point and |dA| are known to rest, which spares the way back to
+    vertices.
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
     with dr.suspend_grad(when=rests):
@@ -89,6 +91,9 @@ def material_segment(
     on_surface = active & si.is_valid()
     offset = si.p - x
     dist2 = dr.squared_norm(offset)
+    # Lights sample themselves: what is no farther than positions are rounded has no direction.
+    on_surface &= dist2 > dr.square(ROUNDING * dr.max(dr.abs(dr.detach(x))))
+    dist2 = dr.select(on_surface, dist2, 1)
     ω = mi.Vector3f(hit.d)
     ω = dr.select(on_surface, dr.replace_grad(ω, offset * dr.rsqrt(dist2)), ω)
     area = mi.Float(1) if rests else _area_element(si, on_surface)

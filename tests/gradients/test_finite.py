@@ -10,6 +10,7 @@ from helpers import load, motion_of, spec_of
 from problems import PROBLEMS, Problem
 
 from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
 
 SIZE, SPP = 16, 4
 QUICK = ("area_shadow", "sunk_ball")
@@ -52,3 +53,17 @@ def test_quick(llvm, problem):
 @pytest.mark.parametrize("problem", [pytest.param(p, id=p.id) for p in once(PROBLEMS)])
 def test_all_scenes(llvm, problem):
     check(problem, 20)
+
+
+@pytest.mark.parametrize("form", ["spatial", "material"])
+def test_a_glowing_sphere_that_samples_itself(llvm, form):
+    """Mitsuba draws points of the sphere from its own surface, and now and then the very point that it starts from."""
+    pose = mi.ScalarTransform4f().look_at(origin=[3.75, 0, 15], target=[3.75, 0, 0], up=[0, 1, 0])
+    camera = {"type": "perspective", "to_world": pose, "fov": 8, "film": {"type": "hdrfilm", "width": 16, "height": 16}}
+    lamp = {"type": "sphere", "center": [3.75, 0, 0], "radius": 0.9, "emitter": {"type": "area", "radiance": 1.0}}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "lamp": lamp})
+    motion = perturb(scene, "camera.to_world", direction=(0.6, 0.3, -0.5))
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "form": form})
+    motion.attach()
+    integrator.render_forward(scene, motion.params, seed=0, spp=256)
+    assert integrator_specs.rejected(integrator) == 0
