@@ -18,6 +18,7 @@ import numpy as np
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.check import FAIL, PASS, CheckResult
+from psdr_jit.derivative.finite_differences import seen_distance
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.errors import PsdrError, UnsupportedWarning
@@ -33,7 +34,7 @@ DEPTH = 3  # of paths, at most
 LOOK_SPP = 4  # of the derivative that tells whether there is one
 DIRECTIONS = ((0.6, 0.3, -0.5), (1, 0, 0), (0, 1, 0), (0, 0, 1))  # of motions, in the order in which they are tried
 AXIS = (0.2, 1, 0.3)  # of turns
-ASIDE, SKEW = 0.01, (0.8, 0.5, 0.3)  # how far cameras are moved, relative to the scene, and where to
+ASIDE, SKEW = 0.01, (0.8, 0.5, 0.3)  # how far cameras are moved, relative to what they see, and where to
 FINER = 6.0  # by how much the step of a second look at what seems wrong is smaller
 PARTS = "flush contact"  # what warnings of motions that part things say
 TOLERANCE = 0.05  # of the gain: a few seconds of a noisy scene know no better
@@ -94,7 +95,8 @@ def shrunk(scene: mi.Scene) -> mi.Scene:
     for sensor in scene.sensors():
         own = mi.traverse(sensor)
         if "to_world" in own:
-            own["to_world"] = mi.Transform4f().translate([ASIDE * size * x for x in SKEW]) @ own["to_world"]
+            shift = ASIDE * min(size, seen_distance(scene, sensor))
+            own["to_world"] = mi.Transform4f().translate([shift * x for x in SKEW]) @ own["to_world"]
             own.update()
     return scene
 

@@ -29,6 +29,7 @@ ANGLE_STEP = 0.005      # upper bound for rotations [rad]
 VALUE_STEP = 0.01       # relative change of colours, radiances, roughnesses
 CAMERA_STEP = 0.002     # relative change of camera intrinsics: 0.1 px at the border of 100 px
 PATHS_PER_RENDER = 1 << 18   # default spp: as many paths as keep start-up costs below the tracing itself
+SEEN_GRID = 16          # camera rays along each side of the film that tell how far away things are
 FD_SEED = 0x5EED0000    # reference seeds start here, far from the seeds of the estimator
 
 
@@ -171,17 +172,30 @@ def default_step(perturbation: Perturbation, sensor: Any) -> float:
         relative = CAMERA_STEP if p.info.kind == "camera" else VALUE_STEP
         return relative * (p.scale or 1.0)
     # a camera moves everything, so the distance that counts is that of the scene
-    box = p.scene.bbox()
-    target = np.array(p.centre if p.centre and p.info.kind != "camera" else box.center(), dtype=float)
+    box, is_camera = p.scene.bbox(), p.info.kind == "camera"
+    target = np.array(p.centre if p.centre and not is_camera else box.center(), dtype=float)
     eye = np.array(sensor.world_transform() @ mi.Point3f(0)).ravel()[:3]
     radians_per_px = _pixel_angle(sensor)
     size = float(np.linalg.norm(np.array(box.extents(), dtype=np.float64)))
-    px = radians_per_px * max(float(np.linalg.norm(target - eye)), 0.1 * size)
+    # what is seen may be close by in a scene that reaches far: on a large ground, say
+    away, seen = float(np.linalg.norm(target - eye)), seen_distance(p.scene, sensor)
+    px = radians_per_px * (min(max(away, 0.1 * size), seen) if is_camera else max(away, min(0.1 * size, seen)))
     if p.rotation:
-        angle = radians_per_px if p.info.kind == "camera" else px / (p.extent / 2 or 1.0)
+        angle = radians_per_px if is_camera else px / (p.extent / 2 or 1.0)
         return min(ANGLE_STEP, PIXEL_STEP * angle)
     limit = EXTENT_STEP * (p.extent or size)
     return min(limit, PIXEL_STEP * px) / p.scale
+
+
+def seen_distance(scene: mi.Scene, sensor: Any) -> float:
+    """Median distance of what a coarse grid of camera rays meets [scene units]; infinite if that is nothing."""
+    with dr.suspend_grad():
+        i = dr.arange(mi.UInt32, SEEN_GRID**2)
+        film = (mi.Point2f(mi.Float(i % SEEN_GRID), mi.Float(i // SEEN_GRID)) + 0.5) / SEEN_GRID
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
+        t = np.array(scene.ray_intersect_preliminary(ray, coherent=True).t)
+    met = t[np.isfinite(t)]
+    return float(np.median(met)) if len(met) else np.inf
 
 
 def _pixel_angle(sensor: Any) -> float:
