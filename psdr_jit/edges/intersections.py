@@ -7,6 +7,7 @@ is a segment whose ends are the points where an edge of one pierces the other [M
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from .topology import INVALID
 #: Pairs of an edge and a triangle that are tested at once (memory), up to which all are tested, and in all (time) for
 #: one pair of meshes.
 CHUNK = 1 << 18
-ALL_PAIRS = 1 << 24
+ALL_PAIRS = 1 << 18
 MAX_TESTS = 1 << 26
 
 #: Parts in which `near_pairs` may hand out those of a mesh with itself, about three seconds: meshes of long slivers,
@@ -43,9 +44,9 @@ class TriangleMesh:
     edges: np.ndarray  # (E, 2) vertices
     edge_faces: np.ndarray  # (E, 2), INVALID where there is none
 
-    @property
+    @cached_property
     def box(self) -> np.ndarray:
-        return np.stack([self.positions.min(0), self.positions.max(0)])
+        return np.array([[column.min(), column.max()] for column in self.positions.T]).T
 
 
 @dataclass(frozen=True)

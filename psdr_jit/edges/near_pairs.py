@@ -23,11 +23,15 @@ def near_pairs(
     lower_a: np.ndarray, upper_a: np.ndarray, lower_b: np.ndarray, upper_b: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """All pairs (i, j) for which the boxes a_i (N, 3) and b_j (M, 3) overlap, each once, in parts `(i, j)`."""
-    if len(lower_a) == 0 or len(lower_b) == 0:
+    boxes_a, boxes_b = (lower_a, upper_a), (lower_b, upper_b)
+    own, other = _within_reach(boxes_a, boxes_b), _within_reach(boxes_b, boxes_a)
+    if len(own) == 0 or len(other) == 0:
         return
-    origin, h = np.minimum(lower_a.min(0), lower_b.min(0)), _cell(lower_a, upper_a, lower_b, upper_b)
+    low_a, high_a = (np.ascontiguousarray(x[own].T) for x in boxes_a)
+    low_b, high_b = (np.ascontiguousarray(x[other].T) for x in boxes_b)
+    origin, h = np.minimum(low_a.min(1), low_b.min(1))[:, None], _cell(low_a, high_a, low_b, high_b)
     first_a, last_a, first_b, last_b = (
-        np.floor((x - origin) / h).astype(np.int64) for x in (lower_a, upper_a, lower_b, upper_b)
+        np.floor((x - origin) / h).astype(np.int64) for x in (low_a, high_a, low_b, high_b)
     )
     i, cell_a = _entries(first_a, last_a)
     j, cell_b = _entries(first_b, last_b)
@@ -42,45 +46,55 @@ def near_pairs(
         stop = max(begin + 1, int(np.searchsorted(total, before + CHUNK, "right")))
         part = slice(begin, stop)
         count = end[part] - start[part]
-        own = np.repeat(np.arange(begin, stop), count)
-        within = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
-        a, b = i[own], j[start[own] + within]
-        # a pair shares many cells: it counts in the lowest of these
-        here = np.all(np.maximum(first_a[a], first_b[b]) == cell_a[own], axis=1)
-        here &= np.all((lower_a[a] <= upper_b[b]) & (lower_b[b] <= upper_a[a]), axis=1)
-        yield a[here], b[here]
+        entry = np.repeat(np.arange(begin, stop), count)
+        within = np.arange(len(entry)) - np.repeat(np.cumsum(count) - count, count)
+        a, b = i[entry], j[start[entry] + within]
+        for axis in range(3):  # one by one: few are left for the last
+            near = (low_a[axis][a] <= high_b[axis][b]) & (low_b[axis][b] <= high_a[axis][a])
+            # a pair shares many cells: it counts in the lowest of these
+            near &= np.maximum(first_a[axis][a], first_b[axis][b]) == cell_a[axis][entry]
+            a, b, entry = a[near], b[near], entry[near]
+        yield own[a], other[b]
         begin = stop
 
 
-def _cell(lower_a, upper_a, lower_b, upper_b) -> float:
+def _within_reach(boxes: tuple[np.ndarray, np.ndarray], others: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Numbers of the `boxes` that overlap the one box around all others."""
+    near = np.full(len(boxes[0]), len(others[0]) > 0)
+    if near.any():
+        for low, high, other_low, other_high in zip(*(x.T for x in (*boxes, *others)), strict=True):
+            near &= (low <= other_high.max()) & (high >= other_low.min())
+    return np.flatnonzero(near)
+
+
+def _cell(low_a, high_a, low_b, high_b) -> float:
     """Width of the cells."""
-    sizes = [(upper - lower).max(1) for lower, upper in ((lower_a, upper_a), (lower_b, upper_b))]
-    extent = max(upper_a.max(), upper_b.max()) - min(lower_a.min(), lower_b.min())
+    sizes = [np.maximum.reduce(high - low) for low, high in ((low_a, high_a), (low_b, high_b))]
+    extent = max(high_a.max(), high_b.max()) - min(low_a.min(), low_b.min())
     h = max(CELL * max(float(np.median(size)) for size in sizes), extent / 2 ** (BITS - 1), np.finfo(float).tiny)
-    while sum(_count(lower, upper, h) for lower, upper in ((lower_a, upper_a), (lower_b, upper_b))) > ENTRIES * (
-        len(lower_a) + len(lower_b)
-    ):
+    while _count(low_a, high_a, h) + _count(low_b, high_b, h) > ENTRIES * (low_a.shape[1] + low_b.shape[1]):
         h *= 2
     return h
 
 
-def _count(lower: np.ndarray, upper: np.ndarray, h: float) -> float:
+def _count(low: np.ndarray, high: np.ndarray, h: float) -> float:
     """Entries of boxes in cells of width h, about."""
-    return float(np.prod(np.floor((upper - lower) / h) + 1, axis=1).sum())
+    return float(np.multiply.reduce(np.floor((high - low) / h) + 1).sum())
 
 
 def _entries(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For every cell of every box: the number of the box, and the cell (K, 3)."""
+    """For every cell of every box: the number of the box, and the cell (3, K)."""
     size = last - first + 1
-    count = size.prod(1)
-    box = np.repeat(np.arange(len(first)), count)
+    count = np.multiply.reduce(size)
+    box = np.repeat(np.arange(first.shape[1]), count)
     rest = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
-    cell = np.empty((len(box), 3), np.int64)
+    cell = np.empty((3, len(box)), np.int64)
     for axis in range(3):
-        cell[:, axis] = first[box, axis] + rest % size[box, axis]
-        rest //= size[box, axis]
+        along = size[axis][box]
+        cell[axis] = first[axis][box] + rest % along
+        rest //= along
     return box, cell
 
 
 def _key(cell: np.ndarray) -> np.ndarray:
-    return (cell[:, 0] << (2 * BITS)) | (cell[:, 1] << BITS) | cell[:, 2]
+    return (cell[0] << (2 * BITS)) | (cell[1] << BITS) | cell[2]
