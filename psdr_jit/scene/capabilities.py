@@ -119,7 +119,7 @@ class Row(NamedTuple):
 _MOVING = "while geometry, a light's pose or the camera is differentiated; "
 
 SUPPORT = (
-    Row("meshes (obj, ply, serialized, cube, ...)", "yes", "UV seams and split normals are welded"),
+    Row("meshes (obj, ply, serialized, cube, ...)", "yes", "welded; what UVs, normals and colours do at seams is seen"),
     Row("smooth-shaded meshes", "yes",
         "where normals turn away is an edge, and so is the plane of a face far off its normals; light from such a mesh "
         "onto others: 1 to 5 % off, more if it turns in place; lights, mirrors, two-sided bodies and, under point, "
@@ -149,7 +149,7 @@ SUPPORT = (
         "behind glass as in the row above; opacity of a mask, what is under it or a bump map, normals: error"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
-    Row("checkerboard, nearest-neighbour bitmap, face attributes", "yes", "where texture coordinates move: warning"),
+    Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
         "a bump map's slopes step at edges; where bent normals turn from the viewer is none: a few % at outlines"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
