@@ -18,11 +18,12 @@ from .topology import EdgeTopology, connected_components
 #: Difference of unit shading normals, or of texture coordinates, that makes a split edge a visible seam.
 SEAM_TOLERANCE = 1e-4
 
-#: How often parts of a surface are halved so that each seam has two of them; later, every face is a part.
-MOST_HALVINGS = 64
+#: How many edges away the bank of a seam reaches, for each of its faces along the seam.
+REACH = 2
 
-#: Of an integrator: by the name of a mesh, and whether it is painted, its arrays, its seams, and its charts.
-CHARTS: Slot[dict[tuple[str, bool], tuple[list, tuple[bytes, np.ndarray | None]]]] = Slot(dict)
+#: Of an integrator: by the name of a mesh, and whether it is painted, its arrays, the seams (E,) it has had, and its
+#: charts.
+CHARTS: Slot[dict[tuple[str, bool], tuple[list, tuple[np.ndarray, np.ndarray | None]]]] = Slot(dict)
 
 
 def is_smooth(mesh: mi.Mesh) -> bool:
@@ -64,14 +65,12 @@ def charts(
     if not host.split.any():
         return None
     kept, key = memory[CHARTS], (mesh.id(), painted)
-    last = kept[key][1] if key in kept else None
+    last = kept[key][1] if key in kept else (np.zeros(len(host), bool), None)
 
-    def make() -> tuple[bytes, np.ndarray | None]:
-        found = np.array(dr.detach(split_seams(mesh, painted, device)))
-        mask = np.packbits(found).tobytes()
-        if last is not None and last[0] == mask:  # vertices have moved, and normals with them
-            return last
-        return mask, face_charts(host, found, mesh.face_count()) if found.any() else None
+    def make() -> tuple[np.ndarray, np.ndarray | None]:
+        # what has been a seam stays one: normals that are computed anew come and go by rounding
+        seam = last[0] | np.array(dr.detach(split_seams(mesh, painted, device)))
+        return last if (seam == last[0]).all() else (seam, face_charts(host, seam, mesh.face_count()))
 
     return while_unchanged(kept, key, list(mesh_buffers(mesh)), make)[1]
 
@@ -80,40 +79,51 @@ def face_charts(topology: EdgeTopology, seam: np.ndarray, faces: int) -> np.ndar
     """(F,) parts of a surface such that the two faces of every edge in `seam` (E,) are in different ones.
 
     What hangs together without crossing a seam is one part, unless both sides of a seam are in it, as where texture
-    coordinates start anew on a ball: it is halved by the number of edges that have to be crossed from one of them.
+    coordinates start anew on a ball: faces then belong to the bank of the seam that is the fewest edges away, if it is
+    as near as the bank is long.
     """
     inner, cut = ~topology.border & ~seam, ~topology.border & seam
     f0, f1 = (f[inner].astype(np.int64) for f in (topology.f0, topology.f1))
     side0, side1 = (f[cut].astype(np.int64) for f in (topology.f0, topology.f1))
-    for _ in range(MOST_HALVINGS):
-        label = connected_components(faces, f0, f1)
-        within = np.flatnonzero(label[side0] == label[side1])
-        if len(within) == 0:
-            return label
-        part, first = np.unique(label[side0[within]], return_index=True)  # one seam of each part
-        away = _edges_apart(faces, (f0, f1), side0[within[first]])
-        radius = np.full(faces, np.inf)
-        radius[part] = (away[side1[within[first]]] + 1) // 2
-        beyond = away >= radius[label]
-        joined = beyond[f0] == beyond[f1]
-        f0, f1 = f0[joined], f1[joined]
     label = connected_components(faces, f0, f1)
-    torn = np.isin(label, label[side0[label[side0] == label[side1]]])
-    return np.where(torn, faces + np.arange(faces), label)
+    within = label[side0] == label[side1]
+    if not within.any():
+        return label
+    side0, side1 = side0[within], side1[within]
+    bank = _banks(topology, (inner, cut), faces)
+    bank[side0] = np.where(bank[side0] == bank[side1], faces + side0, bank[side0])  # a slit that ends on both sides
+    torn = np.isin(label, label[side0])
+    nearest = _nearest(faces, (f0, f1), np.concatenate([side0, side1]), bank)
+    return np.where(torn & (nearest >= 0), faces + nearest, label)
 
 
-def _edges_apart(faces: int, links: tuple[np.ndarray, np.ndarray], sources: np.ndarray) -> np.ndarray:
-    """(F,) how many of the `links` between two faces have to be crossed from the nearest source; −1: no way."""
+def _banks(topology: EdgeTopology, kinds: tuple[np.ndarray, np.ndarray], faces: int) -> np.ndarray:
+    """(F,) which faces along seams are on the same bank: joined around vertices at which a seam goes on.
+
+    `kinds`: the edges (E,) within the surface that are no seams, and those that are.
+    """
+    inner, cut = kinds
+    count = np.bincount(np.concatenate([topology.w0[cut], topology.w1[cut]]), minlength=int(topology.w1.max()) + 1)
+    goes_on = inner & ((count[topology.w0] > 1) | (count[topology.w1] > 1))
+    return connected_components(faces, *(f[goes_on].astype(np.int64) for f in (topology.f0, topology.f1)))
+
+
+def _nearest(faces: int, links: tuple[np.ndarray, np.ndarray], sources: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(F,) label of the source that is the fewest `links` between two faces away; −1: none is within `REACH`."""
     start, end = np.concatenate(links), np.concatenate(links[::-1])
     end = end[np.argsort(start, kind="stable")]
     count = np.bincount(start, minlength=faces)
     first = np.cumsum(count) - count
-    away, step, front = np.full(faces, -1), 0, sources
-    away[front] = 0
+    found, front = np.full(faces, -1), np.unique(sources)
+    found[front] = label[front]
+    reach, step = REACH * np.bincount(label[front], minlength=int(label.max()) + 1), 0
     while len(front):
-        step, n = step + 1, count[front]
+        step += 1
+        front = front[reach[found[front]] >= step]
+        n = count[front]
         place = np.arange(n.sum()) + np.repeat(first[front] - (np.cumsum(n) - n), n)
-        front = np.unique(end[place])
-        front = front[away[front] < 0]
-        away[front] = step
-    return away
+        reached, value = end[place], np.repeat(found[front], n)
+        new = found[reached] < 0
+        found[reached[new]] = value[new]
+        front = np.unique(reached[new])
+    return found

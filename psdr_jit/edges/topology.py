@@ -36,6 +36,10 @@ class EdgeTopology:
     """(E,) uint32, start of the edge, a vertex of `f0` (not welded)."""
     v1: np.ndarray
     """(E,) uint32, end of the edge, a vertex of `f0` (not welded)."""
+    w0: np.ndarray
+    """(E,) int64, `v0` welded: the same number for all vertices that coincide with it."""
+    w1: np.ndarray
+    """(E,) int64, `v1` welded."""
     f0: np.ndarray
     """(E,) uint32, first face."""
     f1: np.ndarray
@@ -142,6 +146,8 @@ def _rows(faces, kept, start, h0, h1, **counts: int) -> EdgeTopology:
     return EdgeTopology(
         v0=v[:, 0].astype(np.uint32),
         v1=v[:, 1].astype(np.uint32),
+        w0=start[h0],
+        w1=start[3 * (h0 // 3) + (h0 % 3 + 1) % 3],
         f0=f0.astype(np.uint32),
         f1=np.where(border, INVALID, f1).astype(np.uint32),
         corner0=corner0.astype(np.uint8),
