@@ -55,7 +55,7 @@ def test_all_scenes(llvm, problem):
     check(problem, 20)
 
 
-@pytest.mark.parametrize("form", ["spatial", "material"])
+@pytest.mark.parametrize("form", ["spatial", pytest.param("material", marks=pytest.mark.slow)])
 def test_a_glowing_sphere_that_samples_itself(llvm, form):
     """Mitsuba draws points of the sphere from its own surface, and now and then the very point that it starts from."""
     pose = mi.ScalarTransform4f().look_at(origin=[3.75, 0, 15], target=[3.75, 0, 0], up=[0, 1, 0])
