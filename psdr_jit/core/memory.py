@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import drjit as dr
+import mitsuba as mi
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -32,6 +33,11 @@ class Memory:
 
     def __setitem__(self, slot: Slot[T], value: T) -> None:
         self._kept[slot] = value
+
+
+def key_of(shape: mi.Shape) -> str | int:
+    """What stands for a shape in a memory: its id or, as files leave many without one, a number of its own."""
+    return shape.id() or int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:

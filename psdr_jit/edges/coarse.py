@@ -8,9 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import mesh_buffers, mesh_faces, mesh_positions
-from ..core.memory import Memory, Slot, while_unchanged
+from ..core.memory import Memory, Slot, key_of, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
+from ..scene.names import shown_name
 
 #: Angle between a shading normal and its face [degrees] from which the horizons of the faces (`horizons.py`) are worth
 #: samples, and share of the area from which a mesh is bent that far.
@@ -34,10 +35,10 @@ WEIGHTS_OF_LIGHTS = (
 )
 
 #: Of an integrator: by name of a mesh, its arrays when it was looked at, and whether it is bent.
-BENT_MESHES: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
+BENT_MESHES: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
 
 #: Of an integrator: the meshes that have been looked at for a warning, by name, and with which limit.
-LOOKED_AT: Slot[set[tuple[str, float]]] = Slot(set)
+LOOKED_AT: Slot[set[tuple[str | int, float]]] = Slot(set)
 
 
 def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
@@ -48,7 +49,7 @@ def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
 def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
     with dr.suspend_grad():
         kept, buffers = memory[BENT_MESHES], list(mesh_buffers(mesh))
-        return while_unchanged(kept, mesh.id(), buffers, lambda: _bent_share(mesh, BENT) > BENT_SHARE)
+        return while_unchanged(kept, key_of(mesh), buffers, lambda: _bent_share(mesh, BENT) > BENT_SHARE)
 
 
 def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory, so: str = STEPS_OF_FACES) -> None:
@@ -63,13 +64,14 @@ def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory, so: s
     a ball of 8, 12, 16 segments is 2.0, 1.2, 0.2 % too bright. Moved, gains are 1.025, 1.0005 and 1.0002 +- 0.005;
     turned in place, when the true derivative is small, 0.05, 0.2 and 0.4 +- 0.3.
     """
-    for mesh in [mesh for mesh in meshes if (mesh.id(), limit) not in memory[LOOKED_AT]]:
-        memory[LOOKED_AT].add((mesh.id(), limit))
+    for mesh in [mesh for mesh in meshes if (key_of(mesh), limit) not in memory[LOOKED_AT]]:
+        memory[LOOKED_AT].add((key_of(mesh), limit))
         with dr.suspend_grad():
             share = _bent_share(mesh, limit)
         if share > BENT_SHARE:
             warn_once(
-                f"mesh '{mesh.id()}' is shaded with normals that are more than {limit:g} degrees off its faces: {so}; "
+                f"mesh '{shown_name(mesh)}' is shaded with normals that are more than {limit:g} degrees off its "
+                f"faces: {so}; "
                 "split its normals at sharp edges, set face_normals, or use a finer mesh",
                 UnsupportedWarning,
                 memory,

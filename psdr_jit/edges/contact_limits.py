@@ -16,10 +16,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers, mesh_faces
-from ..core.memory import Memory, Slot, while_unchanged
+from ..core.memory import Memory, Slot, key_of, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
+from ..scene.names import shown_name
 from .contacts import Contact
 from .intersections import TriangleMesh
 from .seams import is_smooth
@@ -31,10 +32,10 @@ from .topology import INVALID
 STANDS_OFF = 0.05
 
 #: Of an integrator: by the names of a light and of what touches it, the contact and whether they meet at an angle.
-ANGLES: Slot[dict[tuple[str, str], tuple[Contact, bool]]] = Slot(dict)
+ANGLES: Slot[dict[tuple[str | int, str | int], tuple[Contact, bool]]] = Slot(dict)
 
 #: Of an integrator: by the name of a light that touches something, its arrays, and whether it is shaded smooth.
-BENT: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
+BENT: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
 
 #: Cosine of the angle up to which a normal of a corner is that of its face.
 UNBENT = 1 - 1e-5
@@ -66,8 +67,9 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
     if contacts.movers is not None and job.form == "material" and job.options.depth_limit > 2:
         a, b = contacts.movers
         warn_once(
-            f"shapes '{a.id()}' and '{b.id()}' touch and move against each other: in the material form, which this "
-            "integrator was asked for, the light that goes from one to the other where they meet is wrong (10 % of the "
+            f"shapes '{shown_name(a)}' and '{shown_name(b)}' touch and move against each other: in "
+            "the material form, which this integrator was asked for, the light that goes from one to the other where "
+            "they meet is wrong (10 % of the "
             "derivative) and noisy; use form='spatial', or 'auto', which knows of contacts",
             UnsupportedWarning,
             memory,
@@ -78,8 +80,9 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
         cure = "keep them apart by a hundredth of their size"
         cure += " or give it face_normals" if shaded_smooth(lamp, memory) else ", or use form='spatial', or 'auto'"
         warn_once(
-            f"the area light '{lamp.id()}' touches '{other.id()}' or cuts into it: where the two meet, the derivative "
-            "of the light on it is wrong and noisy (15 % of the total if there is no other light), and so is what one "
+            f"the area light '{shown_name(lamp)}' touches '{shown_name(other)}' or cuts into it: where the two meet, "
+            "the derivative of the light on it is wrong and noisy (15 % of the total if there is no other light), and "
+            "so is what one "
             f"covers of the other if they move against each other; {cure}",
             UnsupportedWarning,
             memory,
@@ -90,7 +93,7 @@ def shaded_smooth(lamp: mi.Shape, memory: Memory) -> bool:
     """Do Mitsuba's weights of samples of the light follow other normals than those of its faces?"""
     if not lamp.is_mesh() or not is_smooth(lamp):
         return False
-    return while_unchanged(memory[BENT], lamp.id(), list(mesh_buffers(lamp)), lambda: _bent(lamp))
+    return while_unchanged(memory[BENT], key_of(lamp), list(mesh_buffers(lamp)), lambda: _bent(lamp))
 
 
 def _bent(mesh: mi.Mesh) -> bool:
@@ -116,7 +119,7 @@ def _with_lamp_at_an_angle(c: Contact, memory: Memory) -> bool:
     """Is one of the two a light, off which the other stands? A contact is one object until a mesh changes."""
     if not (c.a.mesh.is_emitter() or c.b.mesh.is_emitter()):
         return False
-    key = (c.a.mesh.id(), c.b.mesh.id())
+    key = (key_of(c.a.mesh), key_of(c.b.mesh))
     known = memory[ANGLES].get(key)
     if known is None or known[0] is not c:
         known = (c, _at_an_angle(c))

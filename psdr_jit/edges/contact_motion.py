@@ -16,6 +16,7 @@ from ..core.compat import mesh_positions
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
+from ..scene.names import shown_name
 from .contacts import Contact
 from .intersections import TriangleMesh, barycentric
 from .solids import Solid, triangles
@@ -41,7 +42,7 @@ def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
             if solid.index not in velocities:
                 velocities[solid.index] = _velocities(solid)
         if _parts(contact, velocities):
-            names = [f"'{solid.mesh.id()}'" for solid in (contact.a, contact.b)]
+            names = [f"'{shown_name(solid.mesh)}'" for solid in (contact.a, contact.b)]
             what = f"parts of shape {names[0]}" if contact.a is contact.b else f"shapes {names[0]} and {names[1]}"
             warn_once(
                 f"flush contact: {what} touch, and the motion parts them or presses them into each other. To one side "

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, key_of
 from . import intersections as cut
 from .overlaps import box_of
 from .solids import Solid, state_of, triangles
@@ -35,15 +35,15 @@ class Contact:
     b_in_a: Resting
 
 
-#: By the names of two meshes: their states, and the contact found for these (None: they do not touch).
-CONTACTS: Slot[dict[tuple[str, str], tuple]] = Slot(dict)
+#: By two meshes: their states, and the contact found for these (None: they do not touch).
+CONTACTS: Slot[dict[tuple[str | int, str | int], tuple]] = Slot(dict)
 
 
 def find_contacts(solids: list[Solid], memory: Memory) -> list[Contact]:
     """All contacts; pairs whose meshes have not been written to are taken from `memory`."""
     found = []
     for a, b in _touching(solids) + [(s, s) for s in solids if s.parts or s.topology.border.any()]:
-        key, state = (a.mesh.id(), b.mesh.id()), (state_of(a), state_of(b))
+        key, state = (key_of(a.mesh), key_of(b.mesh)), (state_of(a), state_of(b))
         known = memory[CONTACTS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
             known = (state, _within(a) if a is b else _between(a, b))

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_values
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, key_of
 from ..core.sensor_frame import origin_box, sensor_frame
 from ..core.varying import varying
 from ..scene.capabilities import SUPPORTED_SENSORS
@@ -18,7 +18,7 @@ from .shells import edge_shells
 from .topology import build_edge_topology
 
 #: By name of a mesh: its faces, and whether they are one closed surface with its normals outward.
-CLOSED: Slot[dict[str, tuple[mi.UInt32, bool]]] = Slot(dict)
+CLOSED: Slot[dict[str | int, tuple[mi.UInt32, bool]]] = Slot(dict)
 
 #: Pairs of a face and a vertex up to which a mesh is looked at.
 MAX_PAIRS = 2**22
@@ -58,12 +58,12 @@ def is_convex_body(shape: mi.Shape, facts: ShapeFacts, memory: Memory) -> bool:
 def _is_closed(mesh: mi.Mesh, memory: Memory) -> bool:
     """One closed surface with its normals outward. Remembered while the faces are the same."""
     faces = faces_buffer(mesh)
-    known = memory[CLOSED].get(mesh.id())
+    known = memory[CLOSED].get(key_of(mesh))
     if known is None or not same_values(known[0], faces):
         p, f = np.array(dr.detach(mesh_positions(mesh))).T, np.array(mesh_faces(mesh)).T
         topology = build_edge_topology(p, f)
         known = (faces, len(topology) > 0 and bool((edge_shells(topology, p, f) > 0).all()))
-        memory[CLOSED][mesh.id()] = known
+        memory[CLOSED][key_of(mesh)] = known
     return known[1]
 
 

@@ -17,9 +17,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, key_of
 from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
+from ..scene.names import shown_name
 from . import intersections as cut
 from .overlaps import box_of, crossing
 from .parts import crosses_itself, cut_parts
@@ -30,14 +31,14 @@ from .topology import EdgeTopology
 #: Pieces into which the full circle of a ball in a plane is cut.
 ARC_PIECES = 64
 
-#: By the names of two shapes: their states, and the junctions found for these.
-PAIRS: Slot[dict[tuple[str, str], tuple]] = Slot(dict)
+#: By two shapes: their states, and the junctions found for these.
+PAIRS: Slot[dict[tuple[str | int, str | int], tuple]] = Slot(dict)
 
 #: Edges of a mesh up to which it is looked at anew in every place whether it cuts itself: a cost per call.
 FEW_EDGES = 500
 
-#: By the name of a mesh: its topology, and whether it cut itself when that was new.
-CUTTING: Slot[dict[str, tuple[EdgeTopology, bool]]] = Slot(dict)
+#: By mesh: its topology, and whether it cut itself when that was new.
+CUTTING: Slot[dict[str | int, tuple[EdgeTopology, bool]]] = Slot(dict)
 
 #: The junctions (by identity) that were uploaded last, and their table.
 UPLOADED: Slot[tuple | None] = Slot(lambda: None)
@@ -77,7 +78,7 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
     """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `memory`."""
     found, pairs, changed = [], [], False
     for a, b in _pairs(solids, balls, memory):
-        key = (a.mesh.id(), (b.mesh if isinstance(b, Solid) else b.shape).id())
+        key = (key_of(a.mesh), key_of(b.mesh if isinstance(b, Solid) else b.shape))
         state = (state_of(a), state_of(b))
         known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
@@ -108,10 +109,10 @@ def _pairs(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> list
 
 def _cuts_itself(solid: Solid, memory: Memory) -> bool:
     """Does, or may, a connected surface of the mesh cut itself? A large one is looked at when its topology is new."""
-    known = memory[CUTTING].get(solid.mesh.id())
+    known = memory[CUTTING].get(key_of(solid.mesh))
     if known is None or known[0] is not solid.topology:
         known = (solid.topology, len(solid.topology) <= FEW_EDGES or _crosses(solid))
-        memory[CUTTING][solid.mesh.id()] = known
+        memory[CUTTING][key_of(solid.mesh)] = known
     return known[1]
 
 
@@ -140,7 +141,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
     try:
         found = cut.mesh_mesh(mesh_a, mesh_b)
     except cut.TooManyPairs:
-        return _too_many(f"shapes '{a.mesh.id()}' and '{b.mesh.id()}'")
+        return _too_many(f"shapes '{shown_name(a.mesh)}' and '{shown_name(b.mesh)}'")
     return _between(a, mesh_a, b, mesh_b, found)
 
 
@@ -150,7 +151,7 @@ def _within(solid: Solid, memory: Memory) -> tuple | None:
     try:
         found = cut.mesh_itself(mesh) if _cuts_itself(solid, memory) else cut_parts(mesh, solid.parts)
     except cut.TooManyPairs:
-        return _too_many(f"parts of shape '{solid.mesh.id()}'")
+        return _too_many(f"parts of shape '{shown_name(solid.mesh)}'")
     return _between(solid, mesh, solid, mesh, found)
 
 

@@ -12,6 +12,7 @@ from ..core.ellipsoid import Ellipsoid
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
+from ..scene.names import shown_name
 from ..scene.tubes import Ellipsoids
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
@@ -102,8 +103,8 @@ def warn_about_touching(bodies: Ellipsoids, memory: Memory) -> None:
         own = np.flatnonzero(owner == k)
         if len(own) > MOST_PAIRED or crossing([np.stack([c[i] - r[i], c[i] + r[i]]) for i in own]):
             warn_once(
-                f"ellipsoids of shape '{shape.id()}' may cut into each other: the curves where they meet are not "
-                "found, and outlines inside of others count; keep them apart, or use meshes",
+                f"ellipsoids of shape '{shown_name(shape)}' may cut into each other: the curves where they meet are "
+                "not found, and outlines inside of others count; keep them apart, or use meshes",
                 UnsupportedWarning,
                 memory,
             )

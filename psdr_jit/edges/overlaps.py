@@ -7,13 +7,14 @@ import warnings
 import mitsuba as mi
 import numpy as np
 
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, key_of
 from ..errors import UnsupportedWarning
+from ..scene.names import shown_name
 from .intersections import RESTING
 from .tessellation import cut_each_other
 
 #: Names of the pairs that have been warned about.
-SAID: Slot[set[tuple[str, str]]] = Slot(set)
+SAID: Slot[set[tuple[str | int, str | int]]] = Slot(set)
 
 #: Shapes without triangles.
 ANALYTIC = ("disk", "cylinder", "sphere", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids")
@@ -57,12 +58,13 @@ def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, 
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
         covered = not curved or curved == ["sphere"]
         covered |= curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))
-        key = (a.id(), b.id())
+        key = (key_of(a), key_of(b))
         if not covered and key not in memory[SAID] and cut_each_other(shapes[i], shapes[j]):
             memory[SAID].add(key)
             warnings.warn(
-                f"shapes '{a.id()}' ({kind_a}) and '{b.id()}' ({kind_b}) cut into each other: the curve where they "
-                "meet is found for meshes and for a sphere in a mesh only, its part of the derivative is missing; "
+                f"shapes '{shown_name(a)}' ({kind_a}) and '{shown_name(b)}' ({kind_b}) cut into each other: "
+                "the curve where they meet is found for meshes and for a sphere in a mesh only, its part of the "
+                "derivative is missing; "
                 "replace curved shapes by meshes",
                 UnsupportedWarning,
                 stacklevel=2,

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers, mesh_faces
-from ..core.memory import Memory, Slot, while_unchanged
+from ..core.memory import Memory, Slot, key_of, while_unchanged
 from .copies import attributes
 from .geometry import EdgeTopologyDevice
 from .topology import EdgeTopology, connected_components
@@ -21,9 +21,9 @@ SEAM_TOLERANCE = 1e-4
 #: How many edges away the bank of a seam reaches, for each of its faces along the seam.
 REACH = 2
 
-#: Of an integrator: by the name of a mesh, and whether it is painted, its arrays, the seams (E,) it has had, and its
+#: Of an integrator: by mesh, and whether it is painted, its arrays, the seams (E,) it has had, and its
 #: charts.
-CHARTS: Slot[dict[tuple[str, bool], tuple[list, tuple[np.ndarray, np.ndarray | None]]]] = Slot(dict)
+CHARTS: Slot[dict[tuple[str | int, bool], tuple[list, tuple[np.ndarray, np.ndarray | None]]]] = Slot(dict)
 
 
 def is_smooth(mesh: mi.Mesh) -> bool:
@@ -64,7 +64,7 @@ def charts(
     host, device = topology
     if not host.split.any():
         return None
-    kept, key = memory[CHARTS], (mesh.id(), painted)
+    kept, key = memory[CHARTS], (key_of(mesh), painted)
     last = kept[key][1] if key in kept else (np.zeros(len(host), bool), None)
 
     def make() -> tuple[np.ndarray, np.ndarray | None]:

@@ -15,10 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_values
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory, Slot, key_of
 from ..core.upload import uploaded
 from ..core.varying import varying
 from ..errors import SceneError, UnsupportedWarning
+from ..scene.names import shown_name
 from .coinciding import PointsBetween, divided, join_coinciding
 from .contacts import Contact, find_contacts
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
@@ -47,8 +48,8 @@ class MeshTopology:
     place: mi.Float | None = None  # the vertices for which it was last found to hold, kept alive likewise
 
 
-#: By name of a mesh and its numbers of vertices and faces.
-TOPOLOGIES: Slot[dict[tuple[str, int, int], MeshTopology]] = Slot(dict)
+#: By mesh and its numbers of vertices and faces.
+TOPOLOGIES: Slot[dict[tuple[str | int, int, int], MeshTopology]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -114,18 +115,18 @@ def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
 
 def known_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
     """What `edge_set` has found out about `mesh` in this call, or what it would."""
-    known = memory[TOPOLOGIES].get((mesh.id(), mesh.vertex_count(), mesh.face_count()))
+    known = memory[TOPOLOGIES].get((key_of(mesh), mesh.vertex_count(), mesh.face_count()))
     return known or _cached_topology(mesh, dr.detach(mesh_positions(mesh)), mesh_faces(mesh), memory)
 
 
 def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> MeshTopology:
-    key = (mesh.id(), dr.width(positions), dr.width(faces))
+    key = (key_of(mesh), dr.width(positions), dr.width(faces))
     known = memory[TOPOLOGIES].get(key)
     if known is not None and _still_holds(known, mesh, positions, faces):
         return known
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
-    warn_about_mesh(mesh.id(), topology)
+    warn_about_mesh(shown_name(mesh), topology)
     shell = edge_shells(topology, p, f)
     facing = np.zeros(len(f), np.float32)
     facing[topology.f0] = shell

@@ -26,6 +26,13 @@ def plugin_name(node: mi.Object) -> str:
     return PLUGIN_NAMES.get(known, known)
 
 
+def shown_name(shape: mi.Shape) -> str:
+    """What messages call a shape: its id or, as files leave many without one, what it is."""
+    if shape.id():
+        return shape.id()
+    return f"unnamed {plugin_name(shape)}" + (f" of {shape.face_count()} faces" if shape.is_mesh() else "")
+
+
 def traverse(scene: Any, spellings: Iterable[str] = ()) -> Any:
     """`mi.traverse(scene)` with stable names: `mi.SceneParameters`, in the same order.
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, texcoords_buffer
-from ..core.memory import Memory, Slot, while_unchanged
+from ..core.memory import Memory, Slot, key_of, while_unchanged
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
@@ -23,8 +23,8 @@ from .names import plugin_name
 #: By how much the faces may cover their part of the texture more than once, relative to its size: rounding.
 TOLERANCE = 1e-3
 
-#: Of an integrator: by the name of a light, its arrays, and whether its faces overlap in the texture.
-OVERLAPS: Slot[dict[str, tuple[list, bool]]] = Slot(dict)
+#: Of an integrator: by light, its arrays, and whether its faces overlap in the texture.
+OVERLAPS: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
 
 
 def warn_about_painted_lights(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
@@ -51,7 +51,8 @@ def warn_about_painted_lights(scene: mi.Scene, facts: SceneFacts, memory: Memory
 
 def _overlap(mesh: mi.Mesh, memory: Memory) -> bool:
     buffers = [dr.detach(texcoords_buffer(mesh)), dr.detach(faces_buffer(mesh))]
-    return while_unchanged(memory[OVERLAPS], mesh.id(), buffers, lambda: _covers_twice(*(np.array(b) for b in buffers)))
+    kept = memory[OVERLAPS]
+    return while_unchanged(kept, key_of(mesh), buffers, lambda: _covers_twice(*(np.array(b) for b in buffers)))
 
 
 def _covers_twice(texcoords: np.ndarray, faces: np.ndarray) -> bool:
