@@ -25,16 +25,17 @@ def sentence(rows: list[Row]) -> str:
     words = Counter(row["word"] for row in rows)
     refused = [row for row in rows if row["word"] == REFUSED]
     media = sum(MEDIUM in row["reason"] for row in refused)
-    silent, seconds = sum(words[word] for word in SILENT), max(row["settings"]["seconds"] for row in rows)
+    silent, seconds = sum(words[word] for word in SILENT), [row["settings"]["seconds"] for row in rows]
+    limits = " to ".join(f"{s:g}" for s in sorted({min(seconds), max(seconds)}))
     folders = " and ".join(sorted({scene_of(row).partition("/")[0] for row in rows}))
     other = {word: count for word, count in words.items() if word not in (*SILENT, WARNED, REFUSED)}
     more = "".join(f", {count} {word}" for word, count in other.items())
     return (
         f"**Scenes by others.** Of {len(rows)} pairs of a scene and something in it that moves ({folders}, "
         f"{len({scene_of(row) for row in rows})} scenes), {silent} are computed without a warning, {words[WARNED]} "
-        f"with one, {len(refused)} are refused ({media} for participating media){more}. In checks of {seconds:g} s, "
+        f"with one, {len(refused)} are refused ({media} for participating media){more}. In checks of {limits} s, "
         f"finite differences confirm {words[COMPUTED]} of the {silent} to {100 * TOLERANCE:.0f} % and contradict "
-        f"{words[WRONG]}; for {words[UNDECIDED]} that is too short."
+        f"{words[WRONG] or 'none'}; for {words[UNDECIDED]} that is too short."
     )
 
 
