@@ -31,7 +31,7 @@ def test_the_sentence_counts():
     text = survey_tables.sentence(rows())
     assert "Of 5 pairs" in text and "(data and lessons, 3 scenes)" in text
     assert "2 are computed without a warning, 1 with one, 2 are refused (1 for participating media)." in text
-    assert "confirm 1 of the 2 to 5 % and contradict 0; for 1 that is too short" in text
+    assert "confirm 1 of the 2 to 5 % and contradict none; for 1 that is too short" in text
     assert "off by 3.00 of their own standard errors" in survey_tables.undecided_words(rows())
 
 
