@@ -27,7 +27,7 @@ from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transf
 from ..edges.points import LEAST_SLANT, clear_of_lift
 from ..plan.job import Job
 from ..plan.motion import Displacements
-from ..plan.probe_motion import registry_table
+from ..plan.probe_motion import registry_values
 from .chain_patterns import INSET, NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
 
@@ -97,7 +97,7 @@ class AnalyticShapes:
         if not chosen:
             return None
         shapes = tuple(job.scene.shapes()[s.index] for s in chosen)
-        number = sum(registry_table(job.scene, {s.index}) * (i + 1) for i, s in enumerate(chosen))
+        number = registry_values(job.scene, {s.index: i + 1 for i, s in enumerate(chosen)})
         columns = tuple(dr.detach(c) for c in attached_to_world(shapes, dr.arange(mi.UInt32, len(shapes))))
         kind = mi.UInt32([list(CURVES_OF).index(s.plugin) for s in chosen])
         dr.eval(number, columns, kind)

@@ -21,7 +21,7 @@ from ..edges.scene_patterns import steps_of
 from ..edges.seams import charts
 from ..edges.segments import known_topology
 from ..plan.job import Job
-from ..plan.probe_motion import registry_table
+from ..plan.probe_motion import registry_values
 from ..scene.facts import ShapeFacts
 
 #: Number of no family.
@@ -64,7 +64,10 @@ class ChainPatterns:
         """None if nothing steps."""
         shapes = [s for s in job.facts.shapes if s.index >= 0]
         found = [steps_of(job, s) if s.patterns else ([], False) for s in shapes]
-        parts = [_charts(job, s, between_faces) for s, (_, between_faces) in zip(shapes, found, strict=True)]
+        parts = [
+            np.arange(s.faces) if between_faces else _charts(job, s)
+            for s, (_, between_faces) in zip(shapes, found, strict=True)
+        ]
         if not any(families for families, _ in found) and all(part is None for part in parts):
             return None
         columns, start, count = [(0.0, 0.0, 0.0, 0.0, 0.0)], [], []
@@ -74,16 +77,16 @@ class ChainPatterns:
             columns += [(*f.a, f.b, max(f.first, -LARGEST), min(f.last, LARGEST)) for f in families]
         a0, a1, b, first, last = (uploaded(mi.Float, np.array(column)) for column in zip(*columns, strict=True))
 
-        def by_registry(values: list[int]) -> mi.UInt32:
-            tables = (registry_table(job.scene, {s.index}) * v for s, v in zip(shapes, values, strict=True) if v)
-            return sum(tables, registry_table(job.scene, set()))
-
         widths = [0 if part is None else len(part) for part in parts]
         faces = [1 + sum(widths[:i]) if width else 0 for i, width in enumerate(widths)]
         chart = uploaded(mi.UInt32, np.concatenate([[0], *(part for part in parts if part is not None)]))
         seams = [SEAMS.get(s.plugin, 0) if s.patterns else 0 for s in shapes]
         families = Family(mi.Vector2f(a0, a1), b, first, last)
-        tables = [by_registry(values) for values in (start, count, faces, seams)]
+        numbers = [s.index for s in shapes]
+        tables = [
+            registry_values(job.scene, dict(zip(numbers, values, strict=True)))
+            for values in (start, count, faces, seams)
+        ]
         dr.eval(families, tables, chart)
         return ChainPatterns(families, tables[0], tables[1], max(count), tables[2], chart, tables[3])
 
@@ -135,10 +138,8 @@ SEAMS = {"sphere": 1, "cylinder": 1, "disk": 2}
 LARGEST = 2.0**24
 
 
-def _charts(job: Job, facts: ShapeFacts, between_faces: bool) -> np.ndarray | None:
-    """(F,) the chart of each face of a mesh; None: no edges of it are steps."""
-    if between_faces:
-        return np.arange(facts.faces)
+def _charts(job: Job, facts: ShapeFacts) -> np.ndarray | None:
+    """(F,) the chart of each face of a mesh; None: it has no seams."""
     if facts.kind != "mesh" or not (facts.smooth or facts.painted):
         return None
     mesh = job.scene.shapes()[facts.index]

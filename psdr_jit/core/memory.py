@@ -9,6 +9,8 @@ from typing import Any, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from .surface_code import registry_index
+
 K = TypeVar("K")
 T = TypeVar("T")
 
@@ -37,7 +39,7 @@ class Memory:
 
 def key_of(shape: mi.Shape) -> str | int:
     """What stands for a shape in a memory: its id or, as files leave many without one, a number of its own."""
-    return shape.id() or int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+    return shape.id() or registry_index(shape)
 
 
 def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:

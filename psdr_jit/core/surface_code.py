@@ -23,6 +23,11 @@ MOST_INSTANCES, MOST_PARTS = 1 << PART_SHIFT, 1 << (31 - PART_SHIFT)
 """Registry indices of instances, and parts, must be below these."""
 
 
+def registry_index(shape: mi.Shape) -> int:
+    """The number that no other living shape has. On the host, as it is: no kernel runs."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
 def parts_are_shapes() -> bool:
     """Is a part known by its registry index (OptiX), or by its place in the group (Embree)?"""
     return dr.backend_v(mi.Float) == dr.JitBackend.CUDA

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.sdf_cell import Cell
-from ..core.surface_code import INSTANCED, PART_SHIFT, parts_are_shapes
+from ..core.surface_code import INSTANCED, PART_SHIFT, parts_are_shapes, registry_index
 from ..core.upload import uploaded
 from ..scene.grids import VALUES
 from .edge_shapes import GridPlace
@@ -160,11 +160,11 @@ def grid_set(places: tuple[GridPlace, ...]) -> GridSet | None:
 
 
 def _code(place: GridPlace) -> int:
-    own = int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(place.shape))[0])
+    own = registry_index(place.shape)
     if place.instance is None:
         return own
     part = own if parts_are_shapes() else place.place
-    return INSTANCED | (part << PART_SHIFT) | int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(place.instance))[0])
+    return INSTANCED | (part << PART_SHIFT) | registry_index(place.instance)
 
 
 def _vectors(table: np.ndarray) -> tuple[mi.Vector3f, ...]:

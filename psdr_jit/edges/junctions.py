@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.memory import Memory, Slot, key_of
+from ..core.surface_code import registry_index
 from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
 from ..scene.names import shown_name
@@ -109,10 +110,11 @@ def _pairs(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> list
 
 def _cuts_itself(solid: Solid, memory: Memory) -> bool:
     """Does, or may, a connected surface of the mesh cut itself? A large one is looked at when its topology is new."""
-    known = memory[CUTTING].get(key_of(solid.mesh))
+    key = key_of(solid.mesh)
+    known = memory[CUTTING].get(key)
     if known is None or known[0] is not solid.topology:
         known = (solid.topology, len(solid.topology) <= FEW_EDGES or _crosses(solid))
-        memory[CUTTING][key_of(solid.mesh)] = known
+        memory[CUTTING][key] = known
     return known[1]
 
 
@@ -186,7 +188,7 @@ def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.nda
     shells[solid.topology.f1[~border]] = np.array(solid.shell)[~border]
     shell = shells[face]
     return {
-        "shape": np.full(len(face), _registry_index(solid.mesh)),
+        "shape": np.full(len(face), registry_index(solid.mesh)),
         "prim": face,
         "uv_start": cut.barycentric(start, corners)[:, 1:],
         "uv_end": cut.barycentric(end, corners)[:, 1:],
@@ -201,7 +203,7 @@ def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.nda
 def _ball_sheet(ball: Ball, n: np.ndarray, centre: np.ndarray) -> dict:
     count = len(n)
     return {
-        "shape": np.full(count, _registry_index(ball.shape)),
+        "shape": np.full(count, registry_index(ball.shape)),
         "prim": np.zeros(count, int),
         "uv_start": np.zeros((count, 2)),
         "uv_end": np.zeros((count, 2)),
@@ -211,10 +213,6 @@ def _ball_sheet(ball: Ball, n: np.ndarray, centre: np.ndarray) -> dict:
         "shell": np.zeros(count),  # its normal turns along an arc: nothing is pruned by it
         "index": np.zeros(count, int),
     }
-
-
-def _registry_index(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
 def _upload(found: list[tuple]) -> JunctionTable:

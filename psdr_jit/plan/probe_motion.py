@@ -6,7 +6,7 @@ how noisy they are is therefore measured for this motion (`driver.pilot`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -150,11 +150,15 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None)
 
 def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
     """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`; −1: every instance."""
-    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
-    table = [0] * (max(ids, default=0) + 1)
     if -1 in chosen:
         chosen = chosen | {k for k, shape in enumerate(scene.shapes()) if is_instance(shape)}
-    for index in chosen:
-        if index >= 0:
-            table[ids[index]] = 1
+    return registry_values(scene, {index: 1 for index in chosen if index >= 0})
+
+
+def registry_values(scene: mi.Scene, values: Mapping[int, int]) -> mi.UInt32:
+    """By registry index of a shape: the value given for its number in `scene.shapes()`, or 0."""
+    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+    table = [0] * (max(ids, default=0) + 1)
+    for index, value in values.items():
+        table[ids[index]] = value
     return mi.UInt32(table)

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.memory import Memory, Slot
+from ..core.surface_code import registry_index
 from ..core.upload import uploaded
 from ..core.varying import varying
 from .facts import SceneFacts
@@ -50,7 +51,7 @@ def moving_grids(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> list[Mov
     for facts_of in facts.shapes:
         if facts_of.kind == "grid" and facts_of.index >= 0 and VALUES in facts_of.geometry:
             shape = scene.shapes()[facts_of.index]
-            number = int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+            number = registry_index(shape)
             cells = mi.traverse(shape)[VALUES].shape[0] - 1
             found.append(
                 MovingGrid(shape, varying(mi.UInt32, number), varying(mi.UInt32, cells), blends_normals(shape, memory))

@@ -9,10 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-import drjit as dr
 import mitsuba as mi
 
-from ..core.surface_code import MOST_INSTANCES, MOST_PARTS, parts_are_shapes
+from ..core.surface_code import MOST_INSTANCES, MOST_PARTS, parts_are_shapes, registry_index
 from ..errors import UnsupportedError
 from .capabilities import COPIES
 from .graph import child_objects
@@ -58,13 +57,9 @@ def require_codes(instances: list[mi.Shape], groups: dict[str, list[mi.Shape]]) 
         return
     parts = max((len(shapes) for shapes in groups.values()), default=0)
     if parts_are_shapes():
-        parts = max((_registry_index(shape) for shapes in groups.values() for shape in shapes), default=0)
-    if max(_registry_index(instance) for instance in instances) >= MOST_INSTANCES or parts >= MOST_PARTS:
+        parts = max((registry_index(shape) for shapes in groups.values() for shape in shapes), default=0)
+    if max(registry_index(instance) for instance in instances) >= MOST_INSTANCES or parts >= MOST_PARTS:
         raise UnsupportedError(
             f"a path cannot tell more than {MOST_INSTANCES - 1} instances, or {MOST_PARTS - 1} shapes in groups, from "
             f"each other (all scenes that are loaded count); {COPIES}, or merge meshes"
         )
-
-
-def _registry_index(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])

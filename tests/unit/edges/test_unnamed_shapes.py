@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from psdr_jit.core.memory import Memory, key_of
-from psdr_jit.edges import junctions
+from psdr_jit.edges import intersections
 from psdr_jit.edges.segments import edge_set
 from psdr_jit.scene.names import shown_name
 
@@ -18,8 +18,8 @@ CUBES = """<scene version="3.0.0">
 
 def test_pairs_of_unnamed_shapes_are_remembered(llvm, monkeypatch):
     scene, looked_at, memory = mi.load_string(CUBES, optimize=False), [], Memory()
-    meshes, search = list(scene.shapes()), junctions._pair
-    monkeypatch.setattr(junctions, "_pair", lambda a, b: looked_at.append((a, b)) or search(a, b))
+    meshes, search = list(scene.shapes()), intersections.mesh_mesh
+    monkeypatch.setattr(intersections, "mesh_mesh", lambda a, b: looked_at.append((a, b)) or search(a, b))
     assert {mesh.id() for mesh in meshes} == {""} and len({key_of(mesh) for mesh in meshes}) == 3
     first, second = (edge_set(meshes, [True] * 3, memory) for _ in range(2))
     assert len(looked_at) == 2  # of both small cubes with the large one, once

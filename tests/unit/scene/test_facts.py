@@ -230,19 +230,6 @@ def grid(filter_type: str) -> dict:
     return {"type": "volume", "volume": {"type": "gridvolume", "grid": cells, "filter_type": filter_type, "raw": True}}
 
 
-@pytest.mark.parametrize("texture, painted", [
-    ({"type": "checkerboard"}, True),
-    ({"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32)), "raw": True}, True),
-    ({"type": "mesh_attribute", "name": "vertex_color"}, True),
-    ({"type": "rgb", "value": 0.5}, False),
-], ids=lambda value: value["type"] if isinstance(value, dict) else "")  # fmt: skip
-def test_painted_surfaces(llvm, texture, painted):
-    """Neither flags of BSDFs nor textures that are attributes say so in Mitsuba 3.9."""
-    scene = mi.load_dict({"type": "scene", "thing": {"type": "cube", "bsdf": {"type": "twosided", "of": {
-        "type": "diffuse", "reflectance": texture}}}, "camera": {"type": "perspective"}})  # fmt: skip
-    assert analyse(scene).shapes[0].painted == painted
-
-
 def test_only_steps_that_are_no_edges_are_warned_about():
     ball = {**BALL, "bsdf": {"type": "diffuse", "reflectance": grid("nearest")}}
     scene = load(ball=ball)

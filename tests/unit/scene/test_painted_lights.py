@@ -1,10 +1,11 @@
-"""Painted lights that Mitsuba samples wrongly are named, and no others."""
+"""What is painted is known, and painted lights that Mitsuba samples wrongly are named, and no others."""
 
 from __future__ import annotations
 
 import warnings
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from psdr_jit.core.memory import Memory
@@ -30,3 +31,21 @@ def test_who_is_named(llvm, case):
         said.append([str(w.message) for w in found])
     assert [len(texts) for texts in said] == [int(named), 0]
     assert all("'lamp'" in text for text in said[0])
+
+
+def bitmap() -> dict:
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32)), "raw": True}
+
+
+@pytest.mark.parametrize("texture, painted", [
+    pytest.param(lambda: PAINTED, True, id="checkerboard"),
+    pytest.param(bitmap, True, id="bitmap"),
+    pytest.param(lambda: COLOURED, True, id="mesh_attribute"),
+    pytest.param(lambda: {"type": "rgb", "value": 0.5}, False, id="rgb"),
+])  # fmt: skip
+def test_painted_surfaces(llvm, texture, painted):
+    """Neither flags of BSDFs nor textures that are attributes say so in Mitsuba 3.9."""
+    bsdf = {"type": "twosided", "of": {"type": "diffuse", "reflectance": texture()}}
+    thing = {"type": "cube", "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "thing": thing, "camera": {"type": "perspective"}})
+    assert analyse(scene).shapes[0].painted == painted
