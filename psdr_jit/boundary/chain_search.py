@@ -7,11 +7,12 @@ Every crossing is then found with expected weight 1, and the cost is that of 1/(
 factor n is found with a weight larger by n/s, and seen by so many fewer lines that each power of n adds 1/s to the
 variance of a corner, times n − 1: what is too narrow to matter is not looked for.
 
-Where a line of a pattern is crossed, texture coordinates tell roughly where: halving then looks close beside that place
-first, on the one side and on the other.
+Of most crossings can be told roughly where they are (`chain_guess`): halving then looks close beside that place first,
+on the one side and on the other.
 
-As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind. What lies in front
-waits for the next kernel; so do, while there are many, intervals that take longer than others.
+As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind; then it comes back to
+what lies in front. While there are many searches that waits for the next kernel instead, and so do intervals that take
+longer than others.
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front, whose
 ends agree otherwise. Crossings of segments before `lines.first_kept` are not kept either: of camera rays, those of the
@@ -29,7 +30,8 @@ import mitsuba as mi
 from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
-from .chain_patterns import NO_FAMILY
+from .chain_guess import NOWHERE, Guesses
+from .chain_outline import AnalyticShapes
 from .searched_lines import SearchedLines
 
 #: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
@@ -39,18 +41,15 @@ PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
 #: Width at which halving ends on steps that rest [px]: they are only walked around.
 AT_REST = 2.0**-4
 
-#: How far beside the place that texture coordinates tell halving looks, times the squared width of the interval [1/px]:
-#: as the error of a linear guess.
-BESIDE = 0.125
-
-#: No such place.
-NOWHERE = -1.0
+#: How far beside a guess halving looks, times the squared width of the interval [1/px]: as the error of a linear one.
+BESIDE = 2.0**-5
 
 #: Looks at an interval and its halves in the first kernel; each further one has twice as many.
 FIRST_LOOKS = 2
 
-#: As few searches as this are followed to their ends, however long; but no more crossings than SLOTS in one kernel.
-#: Where there are more, a search pauses before it halves: it then finds one at most.
+#: As few searches as this are followed to their ends, however long, and back to what lies in front of crossings; but no
+#: more crossings than SLOTS in one kernel. Where there are more, a search pauses before it halves: it then finds one at
+#: most.
 FEW, SLOTS, UNLIMITED = 16384, 8, 2**31
 
 
@@ -115,8 +114,9 @@ class Search:
     def middle(self, least: mi.Float) -> mi.Float:
         """Where the interval [lo, hi] is cut."""
         off = dr.maximum(BESIDE * dr.square(self.hi - self.lo), 0.25 * least)
-        beside = self.guess + dr.select(self.guess - self.lo < self.hi - self.guess, off, -off)
-        inside = (self.guess > self.lo) & (self.guess < self.hi) & (beside > self.lo) & (beside < self.hi)
+        guess = dr.clip(self.guess, self.lo, self.hi)
+        beside = guess + dr.select(guess - self.lo < self.hi - guess, off, -off)
+        inside = (dr.abs(guess - self.guess) < off) & (beside > self.lo) & (beside < self.hi)
         return dr.select(inside, beside, 0.5 * (self.lo + self.hi))
 
     @staticmethod
@@ -142,27 +142,60 @@ class Finds:
         self.found, self.goes_on = dr.zeros(mi.Bool, n), dr.zeros(mi.Bool, n)
         dr.make_opaque(self.crossing, self.before, self.found, self.goes_on)
 
-    def write(self, slot: mi.UInt32, find: tuple[mi.Bool, Crossing], before: tuple, active: mi.Bool) -> None:
-        """`find`: (is it kept, the crossing); `before`: (does its search go on, the interval in front of it)."""
-        i, active = slot * self.stride + self.lane, active & (slot < self.slots)
-        (kept, crossing), (goes_on, interval) = find, before
-        pairs = ((self.crossing, crossing), (self.before, interval), (self.found, kept),
-                 (self.goes_on, goes_on))  # fmt: skip
+    def write(self, slot: mi.UInt32, kept: mi.Bool, crossing: Crossing, active: mi.Bool) -> None:
+        """A crossing, and whether it is kept."""
+        active = active & (slot < self.slots)
+        self._scatter(slot, ((self.crossing, crossing), (self.found, kept)), active)
+
+    def write_front(self, slot: mi.UInt32, front: Interval, active: mi.Bool) -> None:
+        """An interval in front of a crossing that a later kernel goes on with."""
+        active = active & (slot < self.slots)
+        self._scatter(slot, ((self.before, front), (self.goes_on, mi.Bool(True))), active)
+
+    def _scatter(self, slot: mi.UInt32, pairs: tuple, active: mi.Bool) -> None:
         for buffer, value in pairs:
-            dr.scatter(buffer, value, i, active, mode=dr.ReduceMode.Permute)
+            dr.scatter(buffer, value, slot * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
+
+
+#: A stack of intervals: bounds and weight, key. One place more than it holds takes what is written nowhere: masks of
+#: `dr.Local` are not to be relied on (Dr.Jit 1.5, LLVM).
+Stack = tuple[dr.Local, dr.Local]
+
+
+def _stack() -> Stack:
+    return dr.alloc_local(mi.Vector3f, SLOTS + 1), dr.alloc_local(mi.UInt32, SLOTS + 1)
+
+
+def _push(stack: Stack, height: mi.UInt32, at: Interval, active: mi.Bool) -> mi.UInt32:
+    """The height afterwards."""
+    for store, value in zip(stack, (mi.Vector3f(at.lo, at.hi, at.weight), at.key), strict=True):
+        store.write(value, dr.select(active, height, SLOTS))
+    return height + dr.select(active, mi.UInt32(1), 0)
+
+
+def _read(stack: Stack, i: mi.UInt32, sample: mi.UInt32) -> Interval:
+    """Number `i`, from the bottom; all are of the line `sample`."""
+    bounds, key = (store.read(i) for store in stack)
+    return Interval(sample, *bounds, key)
 
 
 @dr.syntax
-def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds) -> Search:
+def _searched(
+    lines: SearchedLines, guesses: Guesses, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds
+) -> Search:
     """Go on with searches until they pause or end; fills `finds`.
 
-    `pause`: the number of looks after which one does, and whether one does before it begins to halve.
+    `pause`: the number of looks after which one does, and whether one does before it begins to halve; it then does not
+    come back to what lies in front of crossings, either.
     """
     most_looks, before_halving = pause
+    stack, height = _stack(), mi.UInt32(0)
     least = lines.least_width
     search = dr.select(mi.Bool(True), search, search)
     looks, slot, active = mi.UInt32(0), mi.UInt32(0), search.mode != END
-    while dr.hint(active, label="psdr.chain.search", exclude=[lines, finds, most_looks, before_halving, least]):
+    while dr.hint(
+        active, label="psdr.chain.search", exclude=[lines, guesses, finds, most_looks, before_halving, least]
+    ):
         at, look, halve = search.at, search.mode == LOOK, search.mode == HALVE
         middle = search.middle(least)
         start = dr.select(look, at.lo, search.lo)
@@ -179,11 +212,12 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         crossed &= ~again
         front = Interval(at.sample, at.lo, dr.select(moves, lo, hi), at.weight, _key(at, 0))
         where = Interval(at.sample, lo, hi, at.weight, at.key)
-        find = moves & ~pair.chosen & (pair.k >= lines.first_kept), Crossing(where, pair.k)
-        goes_on, before = _part(front, mi.Bool(True), lines.narrowest)
+        finds.write(slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), Crossing(where, pair.k), crossed)
+        goes_on, part = _part(front, mi.Bool(True), lines.narrowest)
         whole = pair.chosen & (front.hi - front.lo > lines.narrowest)  # its ends have not been compared
-        before = goes_on | whole, dr.select(whole, front, before)
-        finds.write(slot, find, before, crossed)
+        before, left = dr.select(whole, front, part), crossed & (goes_on | whole)
+        finds.write_front(slot, before, left & before_halving)
+        height = _push(stack, height, before, left & ~before_halving)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         chosen, part = _part(at, pair.specular | checked, lines.narrowest)
@@ -192,14 +226,25 @@ def _searched(lines: SearchedLines, search: Search, pause: tuple[mi.UInt32, mi.B
         ends = ((look & ~apart) | (checked & ~crossed & ~again)) & ~chosen
         narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
         mode = dr.select(halved, dr.select(narrow, mi.UInt32(CHECK), HALVE), LOOK)
-        mode = dr.select(ends, END, mode)
         at = dr.select(halved, at, dr.select(crossed, behind, part))
-        told = dr.select(pair.family != NO_FAMILY, start + pair.where * (end - start), NOWHERE)
-        search = Search(at, mode, lo, hi, moves, dr.select(apart | first, told, search.guess))
+        returns = ends & (height > 0)
+        height -= dr.select(returns, mi.UInt32(1), 0)
+        at = dr.select(returns, _read(stack, height, at.sample), at)
+        mode = dr.select(ends & ~returns, END, mode)
+        guess = dr.select(apart | first, guesses.place(pair, start, end, apart | first), search.guess)
+        search = Search(at, mode, lo, hi, moves, guess)
         looks += dr.select(look, mi.UInt32(1), 0)
         pauses = ((mode == LOOK) & ((looks >= most_looks) | (slot == finds.slots))) | (apart & before_halving)
         active = (mode != END) & ~pauses
+    _write_rest(stack, height, search, finds)
     return search
+
+
+def _write_rest(stack: Stack, height: mi.UInt32, search: Search, finds: Finds) -> None:
+    """What searches that pause have not come back to."""
+    for i in range(SLOTS):
+        number = mi.UInt32(i)
+        finds.write_front(number, _read(stack, number, search.at.sample), number < height)
 
 
 def _joined(parts: list) -> Search | Crossing | None:
@@ -230,11 +275,12 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
     left = Search.begin(Interval(sample, dr.zeros(mi.Float, n), dr.ones(mi.Float, n), dr.ones(mi.Float, n), key))
     found, looks = [], FIRST_LOOKS
+    guesses = Guesses(AnalyticShapes.of(lines.job), any(shape.smooth for shape in lines.job.facts.shapes))
     while left is not None:
         many = _width(left) > FEW
         finds = Finds(_width(left), 1 if many else SLOTS)
         pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
-        search = _searched(lines, left, pause, finds)
+        search = _searched(lines, guesses, left, pause, finds)
         dr.eval(search, finds.crossing, finds.before, finds.found, finds.goes_on)
         found.append(compact(finds.crossing, finds.found))
         before = compact(finds.before, finds.goes_on)
