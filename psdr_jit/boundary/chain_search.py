@@ -3,9 +3,10 @@
 A crossing between the ends of a line (`searched_lines`) shows as their chains part (`chain_trace`), and is found by
 halving. Two crossings may hide each other, so an interval is looked at again: where its ends agree it is cut into n
 parts, and each goes on in its place with probability s/n and n/s of its weight; on both sides of a crossing always.
-Every crossing is then found with expected weight 1, and the cost is that of 1/(1 − s) looks. What is narrower by a
-factor n is found with a weight larger by n/s, and seen by so many fewer lines that each power of n adds 1/s to the
-variance of a corner, times n − 1: what is too narrow to matter is not looked for.
+Every crossing is then found with expected weight 1. What is narrower by a factor n, such as the last bit of a corner,
+is found with a weight larger by n/s, and by so many fewer lines that each power of n adds 1/s times as much to the
+variance: with s = 0.6 throughout, corners of a small light in a curved mirror were 95 % of it. So few intervals are
+looked at again, but those down to what is too narrow to matter.
 
 Of most crossings can be told roughly where they are (`chain_guess`): halving then looks close beside that place first,
 on the one side and on the other.
@@ -34,9 +35,12 @@ from .chain_guess import NOWHERE, Guesses
 from .chain_outline import AnalyticShapes
 from .searched_lines import SearchedLines
 
-#: Into how many parts an interval is cut, by up to which share of a part its borders are moved at random, and with
-#: which probability one of them goes on where the ends agree: if they see a delta lobe, and elsewhere.
-PARTS, CUT_SPREAD, GO_ON, GO_ON_ELSEWHERE = 3, 0.3, 0.6, 0.3
+#: Into how many parts an interval is cut, and by up to which share of a part its borders are moved at random.
+PARTS, CUT_SPREAD = 3, 0.3
+
+#: With which probability one of them goes on where the ends agree: if they see a delta lobe, and the interval is
+#: not such a part, or is one; and elsewhere.
+GO_ON, GO_ON_AGAIN, GO_ON_ELSEWHERE = 0.5, 0.9, 0.3
 
 #: Width at which halving ends on steps that rest [px]: they are only walked around.
 AT_REST = 2.0**-4
@@ -83,7 +87,7 @@ def _uniform(key: mi.UInt32, which: int) -> mi.Float:
 
 def _part(at: Interval, specular: mi.Bool, narrowest: float) -> tuple[mi.Bool, Interval]:
     """`(is one looked at, which)`: a random part of an interval whose ends agree."""
-    share = dr.select(specular, mi.Float(GO_ON), GO_ON_ELSEWHERE)
+    share = dr.select(specular, dr.select(at.weight == 1, mi.Float(GO_ON), GO_ON_AGAIN), GO_ON_ELSEWHERE)
     choice = _uniform(at.key, 0) / share
     chosen, part = (at.hi - at.lo > narrowest) & (choice < 1), dr.minimum(mi.UInt32(PARTS * choice), PARTS - 1)
 
