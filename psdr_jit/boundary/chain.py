@@ -111,7 +111,7 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     hit, β = dr.select(second, of.b, of.a), dr.select(second, of.β_b, of.β_a)
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), i)
     ray = mi.Ray3f(hit.o, hit.d, 0, dr.gather(type(wavelengths), wavelengths, i))
-    limits = job.limits.beyond(of.k)
+    limits = job.limits_beside.beyond(of.k)
     pi = hit.intersection()
     emits = of.emits | is_followed(job, pi.shape.emitter(), pi.is_valid())
     L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), emits, ~of.in_light)

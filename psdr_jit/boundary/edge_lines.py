@@ -118,7 +118,7 @@ def radiance_by_depth(
     """
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), lane)
     by_depth = RadianceByDepth(dr.width(lane), vertices)
-    limits = replace(job.limits, max_depth=vertices)
+    limits = replace(job.limits_beside, max_depth=vertices)
     final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, emission, active)
     dr.eval(final, by_depth.values, by_depth.reached)
     return by_depth, final

@@ -164,7 +164,7 @@ def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
     if job.options.hide_emitters:
         ray, pi = skip_emitters(job.scene, ray, pi)
         emission = mi.Bool(False)
-    L, _, surface = walk(job.scene, rng, ray, pi, job.limits, NoSink(), emission, differs)
+    L, _, surface = walk(job.scene, rng, ray, pi, job.limits_beside, NoSink(), emission, differs)
     L *= weight
     sky = job.scene.environment() is not None and not job.options.hide_emitters
     alpha = mi.Float(1) if sky else dr.select(surface, mi.Float(1), 0)

@@ -24,6 +24,7 @@ _ULP = 2.0**-24
 #: Odd increments of the key from one use to the next (fractional parts of the golden ratio and of √2).
 _NEXT_DIMENSION = 0x9E3779B9
 _ORDER_KEY = 0x6A09E667
+_ASIDE_KEY = 0xBB67AE85  # (√3)
 
 
 def _mixed(x: mi.UInt32) -> mi.UInt32:
@@ -78,6 +79,10 @@ class LaneSampler:
 
     def _advance(self) -> None:
         self.key = self.key + _NEXT_DIMENSION
+
+    def aside(self, number: mi.UInt32, where: mi.Bool) -> LaneSampler:
+        """A sampler whose numbers are others in the lanes `where`, by `number`, and this one's elsewhere."""
+        return LaneSampler(mi.UInt32(self.index), dr.select(where, _mixed(self.key ^ (number + _ASIDE_KEY)), self.key))
 
     def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
         key = _mixed(self.key)

@@ -39,6 +39,7 @@ class PathLimits:
     tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
     light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
     aim: Aim | None = None  # where the next direction is worth taking
+    aligned: bool = False  # numbers of mirrors and glass are their own: see `walk`
 
     @property
     def mixture(self) -> Mixture:

@@ -1,6 +1,11 @@
 """One detached light-transport walk, used by every term: emitter sampling, BSDF sampling, MIS, Russian roulette.
 
 The walk is Mitsuba's `path` (same densities, same power heuristic); what happens at each vertex is handed to a `Sink`.
+Two walks from beside an edge have random numbers in common, so that noise cancels in their difference. The outline of a
+mirror or of a ball of glass is met edge-on and passes the light straight on: both walks then meet the same surfaces,
+but one of them a vertex later. With `limits.aligned`, vertices of delta lobes alone draw numbers of their own and leave
+those of all others as they are.
+
 Everything here is detached: derivatives are attached later, from records (`interior/sweeps.py`) or not at all
 (`boundary/`, whose radiances are primal quantities).
 """
@@ -126,7 +131,13 @@ def walk(
 
         bsdf = si.bsdf()
         inside = si.is_valid() & (path.k + 1 < limits.max_depth)
-        nee, onward = _scatter(scene, sampler, si, path, last, limits, sink, inside)
+        here = sampler
+        if dr.hint(limits.aligned, mode="scalar"):
+            bends = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            here = sampler.aside(path.k, bends)
+        nee, onward = _scatter(scene, here, si, path, last, limits, sink, inside)
+        if dr.hint(limits.aligned, mode="scalar"):
+            sampler = dr.select(bends, sampler, here)
         L[nee.seen] += path.β * nee.mis * nee.f * nee.value
         sink.scattered(path.k, Scatter(Hit.of(ray, pi), si, bsdf, path.β, met, nee, onward, limits), active)
 

@@ -124,6 +124,11 @@ class Job:
         own_frames = any(shape.sees_frame for shape in self.facts.shapes)
         return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames, tubes=self.tubes)
 
+    @property
+    def limits_beside(self) -> PathLimits:
+        """Limits of walks from beside an edge, which are compared."""
+        return replace(self.limits, aligned=self.facts.has_delta_lobes)
+
 
 def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
     """The curves of the scene, read once per render call."""
