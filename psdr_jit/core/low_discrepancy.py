@@ -21,10 +21,10 @@ from .varying import varying
 #: 2^-24: the upper 24 bits of a 32-bit integer as a number in [0, 1).
 _ULP = 2.0**-24
 
-#: Odd increments of the key from one use to the next (fractional parts of the golden ratio and of √2).
+#: Odd numbers added to keys (fractional parts of the golden ratio, of √2 and of √3).
 _NEXT_DIMENSION = 0x9E3779B9
 _ORDER_KEY = 0x6A09E667
-_ASIDE_KEY = 0xBB67AE85  # (√3)
+_ASIDE_KEY = 0xBB67AE85
 
 
 def _mixed(x: mi.UInt32) -> mi.UInt32:
