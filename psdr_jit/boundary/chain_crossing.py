@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.ad import backpropagate, tangents
-from .chain_outline import AnalyticShapes, Curve, crossed_curve
+from .chain_outline import Curve, crossed_curve
 from .chain_sweeps import AtRest, slope_at_end
 from .chain_trace import ChainRecords, Pair
 from .searched_lines import SearchedLines
@@ -28,7 +28,7 @@ def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
     chain = ChainRecords(dr.width(found.k), lines.world.depth)
     pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
     dr.eval(pair, chain.hits, chain.bends)
-    curve = crossed_curve(AnalyticShapes.of(lines.job), lines.world.patterns, pair)
+    curve = crossed_curve(lines.analytic, lines.world.patterns, pair)
     dr.eval(curve)
     return chain, pair, curve
 

@@ -17,30 +17,17 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..edges.curves import CURVES_OF, local_viewpoint
-from .chain_outline import AnalyticShapes
+from .chain_outline import SIDES, AnalyticShapes, triangle
 from .chain_patterns import NO_FAMILY
 from .chain_trace import Pair
 
 #: No guess.
 NOWHERE = -1.0
 
-#: Sides of a triangle, by its corners.
-SIDES = ((0, 1), (1, 2), (2, 0))
-
 
 def _zero(f: mi.Float, g: mi.Float) -> mi.Float:
     """Share of the way at which what is f at the start and g at the end is 0; infinite where signs agree."""
     return dr.select(f * g < 0, f / (f - g), dr.inf)
-
-
-def _corners(hit: Hit, active: mi.Bool) -> tuple[mi.Bool, list[mi.Point3f]]:
-    """`(is it on a mesh, corners of its triangle)`. Detached."""
-    on_mesh = active & (hit.shape != 0)
-    on_mesh &= dr.reinterpret_array(mi.ShapePtr, dr.select(on_mesh, hit.shape, 0)).is_mesh()
-    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, hit.shape, 0))
-    corners = mesh.face_indices(hit.prim_index, on_mesh)
-    return on_mesh, [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
 
 
 def _past_sides(on_mesh: mi.Bool, x: Sequence[mi.Point3f], line: Hit, other: Hit) -> mi.Float:
@@ -54,22 +41,15 @@ def _past_sides(on_mesh: mi.Bool, x: Sequence[mi.Point3f], line: Hit, other: Hit
 
 def _past_round(shapes: AnalyticShapes, hit: Hit, other: Hit, active: mi.Bool) -> mi.Float:
     """The same of spheres, tubes and disks."""
-    number = dr.gather(mi.UInt32, shapes.number, hit.shape, active & (hit.shape != 0))
-    i = dr.maximum(number, 1) - 1
-    columns = tuple(dr.gather(mi.Vector3f, c, i) for c in shapes.columns)
-    kind = dr.gather(mi.UInt32, shapes.kind, i)
-    sphere, disk = (kind == list(CURVES_OF).index(name) for name in ("sphere", "disk"))
-    flat = dr.select(sphere, mi.Vector3f(1), mi.Vector3f(1, 1, 0))  # a tube's contour is that of a circle
+    shape = shapes.met_by(hit, active)
 
     def beyond(ray: Hit) -> mi.Float:
         """How far the line passes outside of the contour, or of the disk; in local units."""
-        o, d = (local_viewpoint(columns, mi.Vector4f(v.x, v.y, v.z, w)) for v, w in ((ray.o, 1), (ray.d, 0)))
-        o, d = mi.Vector3f(o.x, o.y, o.z), mi.Vector3f(d.x, d.y, d.z)
+        o, d = shape.local(ray.o, 1), shape.local(ray.d, 0)
         on_disk = o - d * (o.z / d.z)
-        closest = o - d * (dr.dot(o * flat, d * flat) / dr.squared_norm(d * flat))
-        return dr.norm(dr.select(disk, on_disk, closest) * flat) - 1
+        return dr.norm(dr.select(shape.disk, on_disk, shape.closest(o, d)) * shape.across) - 1
 
-    return dr.select(number != 0, _zero(beyond(hit), beyond(other)), dr.inf)
+    return dr.select(shape.there, _zero(beyond(hit), beyond(other)), dr.inf)
 
 
 def _across_planes(near: tuple, far: tuple, a: Hit, b: Hit) -> mi.Float:
@@ -98,7 +78,7 @@ class Guesses:
         outlined = active & (pair.family == NO_FAMILY)
         first = pair.a.intersection().t <= pair.b.intersection().t
         near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
-        of_near, of_far = (_corners(hit, outlined) for hit in (near, far))
+        of_near, of_far = (triangle(hit, outlined) for hit in (near, far))
         s = _past_sides(*of_near, near, far)
         t = _past_sides(*of_far, far, near)
         if self.analytic is not None:

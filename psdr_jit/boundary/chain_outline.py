@@ -40,6 +40,9 @@ FARTHER, CUT = 2.0, 4.0
 #: Corners of a triangle in barycentric coordinates of its hits.
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 
+#: Its sides, by their ends.
+SIDES = ((0, 1), (1, 2), (2, 0))
+
 
 @dataclass
 class Outline:
@@ -83,6 +86,30 @@ class Curve:
         return dr.select(self.pattern, dr.dot(self.g, si.uv), F)
 
 
+@dataclass
+class AnalyticShape:
+    """What a hit is on, if that is a sphere, a disk or a cylinder. Detached."""
+
+    there: mi.Bool  # is it?
+    columns: tuple[mi.Vector3f, ...]  # of its object-to-world map
+    sphere: mi.Bool
+    disk: mi.Bool
+
+    @property
+    def across(self) -> mi.Vector3f:
+        """Which local coordinates tell how far a point is from its middle: a tube's contour is that of a circle."""
+        return dr.select(self.sphere, mi.Vector3f(1), mi.Vector3f(1, 1, 0))
+
+    def local(self, v, w: float) -> mi.Vector3f:
+        """A point (w = 1) or a vector (w = 0) in local space."""
+        q = local_viewpoint(self.columns, mi.Vector4f(v.x, v.y, v.z, w))
+        return mi.Vector3f(q.x, q.y, q.z)
+
+    def closest(self, o: mi.Vector3f, d: mi.Vector3f) -> mi.Vector3f:
+        """Where a line passes closest by the middle; local, as the line is."""
+        return o - d * (dr.dot(o * self.across, d * self.across) / dr.squared_norm(d * self.across))
+
+
 @dataclass(frozen=True)
 class AnalyticShapes:
     """Spheres, disks and cylinders of a scene. Host object."""
@@ -103,6 +130,23 @@ class AnalyticShapes:
         dr.eval(number, columns, kind)
         return AnalyticShapes(number, columns, kind)
 
+    def met_by(self, hit: Hit, active: mi.Bool) -> AnalyticShape:
+        """The shape at the end of `hit`."""
+        number = dr.gather(mi.UInt32, self.number, hit.shape, active & (hit.shape != 0))
+        i = dr.maximum(number, 1) - 1
+        columns = tuple(dr.gather(mi.Vector3f, c, i) for c in self.columns)
+        kind = dr.gather(mi.UInt32, self.kind, i)
+        return AnalyticShape(number != 0, columns, *(kind == list(CURVES_OF).index(s) for s in ("sphere", "disk")))
+
+
+def triangle(hit: Hit, active: mi.Bool) -> tuple[mi.Bool, list[mi.Point3f]]:
+    """`(is there one, its corners)`: the triangle at the end of `hit`. Detached."""
+    on_mesh = active & (hit.shape != 0)
+    on_mesh &= dr.reinterpret_array(mi.ShapePtr, dr.select(on_mesh, hit.shape, 0)).is_mesh()
+    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, hit.shape, 0))
+    corners = mesh.face_indices(hit.prim_index, on_mesh)
+    return on_mesh, [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
+
 
 def _resting(hit: Hit, m: mi.Point3f, prim_uv: mi.Point2f) -> Hit:
     """The point `m` of the surface that `hit` meets, as a hit at distance 0."""
@@ -116,13 +160,9 @@ def _closer(a: Outline, b: Outline) -> Outline:
 
 def _edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
     """The side of the triangle at the end of `hit`, which it meets at `p`, that `line` passes closest by."""
-    shape = dr.reinterpret_array(mi.ShapePtr, hit.shape)
-    on_mesh = (hit.shape != 0) & shape.is_mesh()
-    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, hit.shape, 0))
-    corners = mesh.face_indices(hit.prim_index, on_mesh)
-    x = [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
+    on_mesh, x = triangle(hit, mi.Bool(True))
     best = Outline(_resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
-    for i, j in ((0, 1), (1, 2), (2, 0)):
+    for i, j in SIDES:
         along = x[j] - x[i]
         n = dr.cross(along, line.d)
         length = dr.norm(n)
@@ -136,27 +176,21 @@ def _edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
 
 def _analytic_outline(shapes: AnalyticShapes, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
     """The same of shapes without triangles: the contours of spheres and tubes, the rims of disks and tubes."""
-    number = dr.gather(mi.UInt32, shapes.number, hit.shape, hit.shape != 0)
-    there, i = number != 0, dr.maximum(number, 1) - 1
-    columns = tuple(dr.gather(mi.Vector3f, c, i) for c in shapes.columns)
-    kind = dr.gather(mi.UInt32, shapes.kind, i)
-    sphere, disk = (kind == list(CURVES_OF).index(name) for name in ("sphere", "disk"))
-    o, d, q = (local_viewpoint(columns, mi.Vector4f(v.x, v.y, v.z, w)) for v, w in ((line.o, 1), (line.d, 0), (p, 1)))
-    flat = dr.select(sphere, mi.Vector3f(1), mi.Vector3f(1, 1, 0))  # a tube's contour is that of a circle
-    o3, d3 = mi.Vector3f(o.x, o.y, o.z), mi.Vector3f(d.x, d.y, d.z)
-    closest = o3 - d3 * (dr.dot(o3 * flat, d3 * flat) / dr.squared_norm(d3 * flat))
-    radial = dr.normalize(closest * flat)
-    contact = mi.Point3f(radial.x, radial.y, dr.select(sphere, radial.z, closest.z))
+    shape = shapes.met_by(hit, mi.Bool(True))
+    columns, q = shape.columns, shape.local(p, 1)
+    closest = shape.closest(shape.local(line.o, 1), shape.local(line.d, 0))
+    radial = dr.normalize(closest * shape.across)
+    contact = mi.Point3f(radial.x, radial.y, dr.select(shape.sphere, radial.z, closest.z))
     m = transform_point(columns, contact)
     n = dr.normalize(transform_vector(columns, radial))
-    gap = dr.select(there & ~disk, dr.dot(n, line.o - m), dr.inf)
+    gap = dr.select(shape.there & ~shape.disk, dr.dot(n, line.o - m), dr.inf)
     contour = Outline(_resting(hit, m, mi.Point2f(0)), n, gap)
 
     rim = dr.normalize(mi.Vector3f(q.x, q.y, 0))
-    height = dr.select(disk | (q.z < 0.5), mi.Float(0), 1)
+    height = dr.select(shape.disk | (q.z < 0.5), mi.Float(0), 1)
     m = transform_point(columns, mi.Point3f(rim.x, rim.y, height))
     n = dr.normalize(dr.cross(transform_vector(columns, mi.Vector3f(-rim.y, rim.x, 0)), line.d))
-    gap = dr.select(there & ~sphere, dr.dot(n, line.o - m), dr.inf)
+    gap = dr.select(shape.there & ~shape.sphere, dr.dot(n, line.o - m), dr.inf)
     return _closer(contour, Outline(_resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap))
 
 

@@ -32,7 +32,6 @@ from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from .chain_guess import NOWHERE, Guesses
-from .chain_outline import AnalyticShapes
 from .searched_lines import SearchedLines
 
 #: Into how many parts an interval is cut, and by up to which share of a part its borders are moved at random.
@@ -279,7 +278,7 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
     left = Search.begin(Interval(sample, dr.zeros(mi.Float, n), dr.ones(mi.Float, n), dr.ones(mi.Float, n), key))
     found, looks = [], FIRST_LOOKS
-    guesses = Guesses(AnalyticShapes.of(lines.job), any(shape.smooth for shape in lines.job.facts.shapes))
+    guesses = Guesses(lines.analytic, any(shape.smooth for shape in lines.job.facts.shapes))
     while left is not None:
         many = _width(left) > FEW
         finds = Finds(_width(left), 1 if many else SLOTS)

@@ -7,6 +7,7 @@ Those across the film start at the sensor (`chain_lines`), those across what lig
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.streams import Stream, stream_seed
 from ..plan.job import Job
 from .chain_fixed import Directions
+from .chain_outline import AnalyticShapes
 from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
 
 
@@ -40,6 +42,11 @@ class SearchedLines(ABC):
     @abstractmethod
     def least_width(self) -> mi.Float:
         """Width at which halving ends."""
+
+    @cached_property
+    def analytic(self) -> AnalyticShapes | None:
+        """The shapes without triangles that their chains may meet."""
+        return AnalyticShapes.of(self.job)
 
     def guide(self) -> None:
         """Draw the directions of all lines, if anything scatters light."""
