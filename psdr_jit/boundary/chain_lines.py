@@ -25,7 +25,7 @@ from .searched_lines import SearchedLines
 NARROWEST = 2.0**-10
 
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
-LEAST_WIDTH, ROUNDING = 2.0**-14, 5e-7
+LEAST_WIDTH, ROUNDING = 2.0**-12, 5e-7
 
 
 @dataclass

@@ -27,6 +27,7 @@ from ..plan.job import Job
 from ..plan.probe_motion import registry_table
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
+from .chain_lamps import ChainLamps
 from .chain_lobes import has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 
@@ -35,6 +36,9 @@ CHAIN_DEPTH = 8
 
 #: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
 COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
+
+#: Plugins of shapes that bulge everywhere: they cannot hide a part of themselves.
+ROUND = ("sphere", "cylinder")
 
 #: Curved surfaces: offset of one point from the tangent plane of the other, relative to their distance, and difference
 #: of the normals from which on they count as apart.
@@ -48,6 +52,7 @@ class ChainWorld:
     scene: mi.Scene
     depth: int  # largest number of segments
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
+    round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
     patterns: ChainPatterns | None  # None: no surface steps inside
     moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape
     camera: mi.Bool  # may they because the camera does, ...
@@ -56,6 +61,7 @@ class ChainWorld:
     scatters: bool  # are there such vertices at all?
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
     followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
+    lamps: ChainLamps | None = None  # that may hide between two chains
     aims: ChainAims | None = None  # what directions from smooth vertices are aimed at
 
     @staticmethod
@@ -69,6 +75,7 @@ class ChainWorld:
             scene=job.scene,
             depth=depth,
             flat=registry_table(job.scene, flat),
+            round=registry_table(job.scene, {s.index for s in facts.shapes if s.plugin in ROUND}),
             patterns=ChainPatterns.of(job),
             moving=registry_table(job.scene, changing),
             camera=varying(mi.Bool, facts.camera_moves),
@@ -77,6 +84,7 @@ class ChainWorld:
             scatters=facts.scatters,
             mode=mi.TransportMode.Radiance,
             followed=followed_lights(job),
+            lamps=ChainLamps.of(job),
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
@@ -102,6 +110,8 @@ class Pair:
     seen: mi.Bool  # it is the first that sees it
     family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
     where: mi.Float  # between the chains that line lies: share of the way from a to b, roughly
+    lamp: mi.Float  # where between them a lamp may hide, likewise, ...
+    miss: mi.Float  # ... and how near to it they are thought to come [its radius]
     light: LightPoint
     a: Hit  # segment k of each, or the shadow rays from its end
     b: Hit
@@ -114,8 +124,9 @@ class Pair:
         differs, specular, chosen, moves, in_light, seen = (mi.Bool(False) for _ in range(6))
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         a, b = (Hit.made(dr.zeros, 1) for _ in range(2))
+        where, lamp, miss = mi.Float(0.5), mi.Float(0.5), mi.Float(dr.inf)
         return Pair(mi.UInt32(0), differs, specular, chosen, moves, mi.Bool(True), in_light, seen, mi.UInt32(NO_FAMILY),
-                    mi.Float(0.5), light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
+                    where, lamp, miss, light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
 
     @property
     def last(self) -> mi.UInt32:
@@ -161,7 +172,8 @@ def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) ->
     n_a, n_b = a.sh_frame.n, b.sh_frame.n
     off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
     shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
-    one_curve = side & shaded & (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
+    close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
+    one_curve = side & shaded & (close | (dr.gather(mi.UInt32, world.round, index) != 0))
     return same & (~both | dr.select(flat, one_plane & side, one_curve))
 
 
@@ -223,6 +235,11 @@ def trace_pair(
             crossed, family, where = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
             pair.differs |= crossed
             pair.family, pair.where = dr.select(active, family, pair.family), dr.select(active, where, pair.where)
+        if dr.hint(world.lamps is not None, mode="scalar"):
+            share, miss = world.lamps.between(line, (ray_a, a), (ray_b, b))
+            nearer = active & pair.emits & (pair.k > 0) & (miss < pair.miss)
+            pair.lamp = dr.select(nearer, share, pair.lamp)
+            pair.miss = dr.select(nearer, miss, pair.miss)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
         pair.moves |= world.moves(a.shape, b.shape)
         u = Numbers.draw(rng)
@@ -270,6 +287,8 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
         seen=seen_a,
         family=pair.family,
         where=pair.where,
+        lamp=pair.lamp,
+        miss=pair.miss,
         light=dr.select(parts, light, pair.light),
         a=dr.select(parts, hit_a, pair.a),
         b=dr.select(parts, hit_b, pair.b),

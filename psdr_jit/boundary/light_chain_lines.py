@@ -133,6 +133,7 @@ def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
         lights=varying(mi.Bool, job.facts.camera_moves),
         connects=partial(compare_sensor, technique, job.options.hide_emitters),
         mode=mi.TransportMode.Importance,
+        lamps=None,
     )
 
 

@@ -1,0 +1,73 @@
+"""The search for crossings on lines of which it is known where they cross what."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from psdr_jit.boundary.chain_search import find_crossings
+from psdr_jit.boundary.chain_trace import Pair
+
+LINES = 40_000
+
+
+class Striped:
+    """Lines across one stripe each, from `start` to `start + width`. The family keeps guesses out."""
+
+    narrowest, first_kept, analytic = 2.0**-10, 0, None
+
+    def __init__(self, start: np.ndarray, width: float, lamp: bool):
+        self.count, self.start, self.width, self.lamp = len(start), mi.Float(start.astype(np.float32)), width, lamp
+        self.job = SimpleNamespace(seed=7, facts=SimpleNamespace(shapes=()))
+
+    least_width = property(lambda self: mi.Float(2.0**-12))
+
+    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> Pair:
+        start = dr.gather(mi.Float, self.start, sample)
+        inside = [(s > start) & (s < start + self.width) for s in ends]
+        pair = Pair.start()
+        pair.differs, pair.specular, pair.moves = inside[0] != inside[1], mi.Bool(True), mi.Bool(True)
+        pair.family = mi.UInt32(0)
+        if self.lamp:
+            pair.lamp = (start + 0.5 * self.width - ends[0]) / (ends[1] - ends[0])
+            pair.miss = dr.select((pair.lamp > 0) & (pair.lamp < 1), mi.Float(0), dr.inf)
+        return pair
+
+
+def _found(width: float, lamp: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (LINES, 2) with which the edges of a stripe somewhere on a line are found; and errors of their place."""
+    start = np.random.default_rng(3).uniform(0, 1 - width, LINES).astype(np.float32)
+    found = find_crossings(Striped(start, width, lamp)).at
+    sample, lo, hi = (np.array(v) for v in (found.sample, found.lo, found.hi))
+    edges = np.stack((start, start + np.float32(width)), 1)[sample]
+    off = np.abs(edges - ((lo + hi) / 2)[:, None])
+    weights = np.zeros((LINES, 2))
+    np.add.at(weights, (sample, off.argmin(1)), np.array(found.weight))
+    return weights, off.min(1)
+
+
+@pytest.mark.parametrize("width", [0.3, 0.05, 0.01])
+def test_every_crossing_is_found_with_weight_one_on_average(width, llvm):
+    weights, off = _found(width)
+    mean, error = weights.mean(0), weights.std(0) / LINES**0.5
+    assert off.max() < 2.0**-11
+    assert np.abs(mean - 1).max() < 4 * error.max() < 0.35
+
+
+@pytest.mark.parametrize("width", [0.3, 0.05, 0.01])
+def test_both_edges_of_what_is_thin_are_found_together(width, llvm):
+    weights, _ = _found(width)
+    some = weights.sum(1) > 0
+    assert np.mean(weights[some, 0] == weights[some, 1]) > 0.95
+    assert weights.max() < 8 / (0.3 * width)
+
+
+def test_a_lamp_is_found_without_weight(llvm):
+    weights, _ = _found(0.01, lamp=True)
+    assert np.mean(weights[:, 0] == 1) > 0.8
+    assert abs(weights[:, 0].mean() - 1) < 4 * weights[:, 0].std() / LINES**0.5
+    assert np.mean(weights[:, 0] == weights[:, 1]) > 0.99
