@@ -1,12 +1,13 @@
 """Parts of lines that are searched for crossings, and the chances by which they are looked into (`chain_search`).
 
 The ends of an interval agree, but two crossings inside may hide each other. A chain from a place m inside is compared
-with theirs. Where it differs, both sides hold crossings and both are searched, with the weight that the interval has:
-the edges of something thin are found together, and as it moves, what the one brings and what the other does nearly
-cancel. Where it agrees, one of the two sides, by its width, is looked into with probability s, and its weight grows as
-its width shrinks and by 1/s. So every crossing is found with expected weight 1. What is narrower by a factor 2 is found
-with 2/s times the weight, and by so many fewer lines that each such factor adds 1/s times as much to the variance: few
-intervals are looked into at first, and then nearly all, down to what is too narrow to matter.
+with that from the near end. Where they differ, both sides of m hold crossings and both are searched, with the weight
+that the interval has: the edges of something thin are found together, and as it moves, what the one brings and what the
+other does nearly cancel. Where they agree, one of the two sides, by its width, is looked into with probability s, and
+its weight grows as its width shrinks and by 1/s. So every crossing is found with expected weight 1, whatever chains are
+taken to agree: which side is chosen has no say in what is compared. What is narrower by a factor 2 is found with 2/s
+times the weight, and by so many fewer lines that each such factor adds 1/s times as much to the variance: few intervals
+are looked into at first, and then nearly all, down to what is too narrow to matter.
 
 Small and bright lamps are what matters most, and of them one can tell where they hide (`chain_lamps`): m is that place,
 and the interval is always looked into. Elsewhere m lies about the middle, at random.
@@ -67,24 +68,23 @@ class Interval:
         """A place about the middle."""
         return dr.lerp(self.lo, self.hi, 0.5 + CUT_SPREAD * (self._uniform(CUT) - 0.5))
 
-    def takes_behind(self, cut: mi.Float) -> mi.Bool:
-        """Which of the two parts that a cut makes is chosen, by their widths: the one behind it?"""
-        return self._uniform(SIDE) * self.width < self.hi - cut
-
     def half(self, cut: mi.Float) -> Interval:
-        """The part that is chosen; its ends agree."""
-        behind = self.takes_behind(cut)
+        """One of the parts that a cut makes, by their widths. The one behind is fresh."""
+        behind = self._uniform(SIDE) * self.width < self.hi - cut
         lo, hi = dr.select(behind, cut, self.lo), dr.select(behind, self.hi, cut)
-        half = self.part(lo, hi, HALF, mi.Bool(False))
+        half = self.part(lo, hi, HALF, behind)
         half.weight = self.weight * dr.select(half.width > 0, self.width / half.width, 0)
         return half
 
     def kept(self, specular: mi.Bool, sure: mi.Bool, narrowest: float) -> tuple[mi.Bool, Interval]:
-        """`(is it looked into, as what)`: an interval whose ends agree, whether or not they see a delta lobe."""
+        """`(is it looked into, as what)`: an interval whose ends agree, whether or not they see a delta lobe.
+
+        What is fresh is looked at first, and what is `sure` in any case.
+        """
         share = dr.select(specular, dr.select(self.weight == 1, mi.Float(GO_ON), GO_ON_AGAIN), GO_ON_ELSEWHERE)
-        share = dr.select(sure, 1, share)
+        share = dr.select(sure | self.fresh, 1, share)
         kept = (self.width > narrowest) & (self._uniform(KEPT) < share)
-        return kept, Interval(self.sample, self.lo, self.hi, self.weight / share, self.key, mi.Bool(False))
+        return kept, Interval(self.sample, self.lo, self.hi, self.weight / share, self.key, mi.Bool(self.fresh))
 
     def _uniform(self, which: int) -> mi.Float:
         return mi.Float(mi.sample_tea_32(self.key, mi.UInt32(which))[0] >> 8) * 2.0**-24

@@ -51,8 +51,8 @@ FIRST_LOOKS = 2
 FEW, UNLIMITED = 16384, 2**31
 
 
-#: What a search does next: compare the ends of the whole interval, look into it between a place inside and one of its
-#: ends, halve what is between lo and hi, check what halving came to, or nothing.
+#: What a search does next: compare the ends of the whole interval, or a place inside with the near end; halve what is
+#: between lo and hi, check what halving came to; or nothing.
 LOOK, PROBE, HALVE, CHECK, END = range(5)
 
 
@@ -75,12 +75,10 @@ class Search:
 
     def compared(self, least: mi.Float) -> tuple[mi.Float, mi.Float]:
         """The places whose chains are compared next."""
-        at, halves = self.at, self.mode == HALVE
-        probes, behind = self.mode == PROBE, at.takes_behind(self.guess)
-        whole = (self.mode == LOOK) | probes
-        lo = dr.select(probes & behind, self.guess, at.lo)
-        hi = dr.select(probes & ~behind, self.guess, at.hi)
-        return dr.select(whole, lo, self.lo), dr.select(whole, hi, dr.select(halves, self.middle(least), self.hi))
+        at, whole = self.at, self.mode <= PROBE
+        halfway = dr.select(self.mode == HALVE, self.middle(least), self.hi)
+        into = dr.select(self.mode == PROBE, self.guess, at.hi)
+        return dr.select(whole, at.lo, self.lo), dr.select(whole, into, halfway)
 
     def middle(self, least: mi.Float) -> mi.Float:
         """Where what is between lo and hi is halved."""
@@ -96,7 +94,9 @@ class Search:
         probes, checks = self.mode == PROBE, self.mode == CHECK
         lamp = ~checks & (pair.miss < NEAR) & (dr.abs(pair.lamp - 0.5) < WITHIN)
         half = self.at.half(dr.select(probes, self.guess, self.at.middle()))
+        half.fresh |= checks
         part = dr.select(self.mode == LOOK, self.at, half)
+        part.fresh &= self.mode != LOOK
         kept, part = part.kept(pair.specular | checks, lamp, narrowest)
         return kept, part, dr.select(lamp, dr.lerp(start, end, pair.lamp), part.middle())
 
@@ -123,7 +123,7 @@ def _searched(
     while dr.hint(
         active, label="psdr.chain.search", exclude=[lines, guesses, finds, most_looks, before_halving, least]
     ):
-        at, whole, halve = search.at, (search.mode == LOOK) | (search.mode == PROBE), search.mode == HALVE
+        at, whole, halve = search.at, search.mode <= PROBE, search.mode == HALVE
         start, end = search.compared(least)
         pair = lines.compare(at.sample, (start, end))
 
@@ -134,23 +134,18 @@ def _searched(
         moves = dr.select(apart | first | checked, pair.moves, search.moves)
         again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
         crossed = checked & pair.differs & ~again
-        # What lies in front of a place that is found to differ differs from it as well.
-        fresh = dr.select(apart, (search.mode == PROBE) & at.takes_behind(search.guess), at.fresh)
 
         found = Crossing(at.part(lo, hi, FRONT, mi.Bool(False)), pair.k)
         finds.write(slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
-        front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, fresh | pair.chosen)
+        front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, pair.chosen)
         kept, part = front.kept(mi.Bool(True), mi.Bool(False), narrowest)
-        left = crossed & dr.select(front.fresh, front.width > narrowest, kept)
-        front = dr.select(front.fresh, front, part)
-        finds.write_front(slot, front, left & before_halving)
-        height = push(stack, height, front, left & ~before_halving)
+        finds.write_front(slot, part, crossed & kept & before_halving)
+        height = push(stack, height, part, crossed & kept & ~before_halving)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         kept, part, place = search.looked_into(pair, (start, end), narrowest)
         halved = apart | halve | again
         narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
-        at.fresh = mi.Bool(fresh)
         behind = at.part(hi, at.hi, BEHIND, mi.Bool(True))
         at = dr.select(halved, at, dr.select(crossed, behind, part))
         ends = ~halved & ~crossed & ~kept

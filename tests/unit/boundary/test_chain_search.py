@@ -14,14 +14,21 @@ from psdr_jit.boundary.chain_trace import Pair
 
 LINES = 40_000
 
+#: Of awkward lines: where a step that cannot move lies, and how far apart chains are taken to differ.
+AT_REST, FAR = 0.37, 0.21
+
 
 class Striped:
-    """Lines across one stripe each, from `start` to `start + width`. The family keeps guesses out."""
+    """Lines across one stripe each, from `start` to `start + width`. The family keeps guesses out.
+
+    Awkward ones are taken to differ where they are far apart, and see a step that rests.
+    """
 
     narrowest, first_kept, analytic = 2.0**-10, 0, None
 
-    def __init__(self, start: np.ndarray, width: float, lamp: bool):
-        self.count, self.start, self.width, self.lamp = len(start), mi.Float(start.astype(np.float32)), width, lamp
+    def __init__(self, start: np.ndarray, width: float, lamp: bool, awkward: bool):
+        self.count, self.start, self.width = len(start), mi.Float(start.astype(np.float32)), width
+        self.lamp, self.awkward = lamp, awkward
         self.job = SimpleNamespace(seed=7, facts=SimpleNamespace(shapes=()))
 
     least_width = property(lambda self: mi.Float(2.0**-12))
@@ -32,16 +39,19 @@ class Striped:
         pair = Pair.start()
         pair.differs, pair.specular, pair.moves = inside[0] != inside[1], mi.Bool(True), mi.Bool(True)
         pair.family = mi.UInt32(0)
+        if self.awkward:
+            pair.moves = pair.differs | (dr.abs(ends[1] - ends[0]) > FAR)
+            pair.differs = pair.moves | ((ends[0] < AT_REST) & (ends[1] > AT_REST))
         if self.lamp:
             pair.lamp = (start + 0.5 * self.width - ends[0]) / (ends[1] - ends[0])
             pair.miss = dr.select((pair.lamp > 0) & (pair.lamp < 1), mi.Float(0), dr.inf)
         return pair
 
 
-def _found(width: float, lamp: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def _found(width: float, lamp: bool = False, awkward: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Weights (LINES, 2) with which the edges of a stripe somewhere on a line are found; and errors of their place."""
     start = np.random.default_rng(3).uniform(0, 1 - width, LINES).astype(np.float32)
-    found = find_crossings(Striped(start, width, lamp)).at
+    found = find_crossings(Striped(start, width, lamp, awkward)).at
     sample, lo, hi = (np.array(v) for v in (found.sample, found.lo, found.hi))
     edges = np.stack((start, start + np.float32(width)), 1)[sample]
     off = np.abs(edges - ((lo + hi) / 2)[:, None])
@@ -50,9 +60,10 @@ def _found(width: float, lamp: bool = False) -> tuple[np.ndarray, np.ndarray]:
     return weights, off.min(1)
 
 
+@pytest.mark.parametrize("awkward", [False, True])
 @pytest.mark.parametrize("width", [0.3, 0.05, 0.01])
-def test_every_crossing_is_found_with_weight_one_on_average(width, llvm):
-    weights, off = _found(width)
+def test_every_crossing_is_found_with_weight_one_on_average(width, awkward, llvm):
+    weights, off = _found(width, awkward=awkward)
     mean, error = weights.mean(0), weights.std(0) / LINES**0.5
     assert off.max() < 2.0**-11
     assert np.abs(mean - 1).max() < 4 * error.max() < 0.35
