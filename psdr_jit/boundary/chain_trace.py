@@ -8,8 +8,9 @@ is the product of the lobes' values over their probabilities.
 Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
 shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
 unless one point lies far off the other's tangent plane for their distance (a surface in front of itself) or their
-normals differ (a crease). Such a guess may be wrong
-for rays that are far apart, which costs time, and is right for those close by, which is what counts.
+normals differ (a crease), which spheres and cylinders know nothing of. Such a guess may be wrong for rays that are far
+apart, which costs time, and is right for those close by, which is what counts. On the way, lamps are looked out for
+that may hide between the two (`chain_lamps`).
 """
 
 from __future__ import annotations
