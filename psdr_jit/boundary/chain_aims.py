@@ -16,7 +16,7 @@ import mitsuba as mi
 from ..core.cones import Cones
 from ..edges.kind import Use
 from ..plan.job import Job
-from ..sampling.mirror_images import SeenBall, SeenBalls, with_images
+from ..sampling.mirror_images import SeenBalls, lamp_balls, with_images
 from ..sampling.relevance import Movers, movers_of
 
 #: Widest cone around what moves that is aimed at, 1 − cos of its half angle: next to it, all directions lead there.
@@ -33,8 +33,7 @@ class ChainAims:
     @staticmethod
     def of(job: Job) -> ChainAims | None:
         """None if there is nothing to aim at."""
-        shapes = job.scene.shapes()
-        lamps = [SeenBall.around([shapes[s.index]]) for s in job.facts.shapes if s.index >= 0 and s.is_emitter]
+        lamps = lamp_balls(job)
         images = with_images(job, lamps)[len(lamps) :]
         movers = movers_of(job, Use.STEP)
         if not images and movers is None:

@@ -16,7 +16,7 @@ import numpy as np
 from ..core.upload import uploaded
 from ..core.varying import varying
 from ..plan.job import Job
-from ..sampling.mirror_images import SeenBall
+from ..sampling.mirror_images import lamp_balls
 
 #: How near a line of sight must come, in radii of the ball around a lamp, to be thought to meet it.
 NEAR = 1.5
@@ -33,8 +33,7 @@ class ChainLamps:
     @staticmethod
     def of(job: Job) -> ChainLamps | None:
         """None if no shape emits light."""
-        shapes = job.scene.shapes()
-        lamps = [SeenBall.around([shapes[s.index]]) for s in job.facts.shapes if s.index >= 0 and s.is_emitter]
+        lamps = lamp_balls(job)
         if not lamps:
             return None
         centres = np.array([lamp.centre for lamp in lamps], np.float32).T

@@ -94,9 +94,8 @@ class Search:
         probes, checks = self.mode == PROBE, self.mode == CHECK
         lamp = ~checks & (pair.miss < NEAR) & (dr.abs(pair.lamp - 0.5) < WITHIN)
         half = self.at.half(dr.select(probes, self.guess, self.at.middle()))
-        half.fresh |= checks
         part = dr.select(self.mode == LOOK, self.at, half)
-        part.fresh &= self.mode != LOOK
+        part.fresh = checks | (probes & half.fresh)
         kept, part = part.kept(pair.specular | checks, lamp, narrowest)
         return kept, part, dr.select(lamp, dr.lerp(start, end, pair.lamp), part.middle())
 
@@ -135,7 +134,7 @@ def _searched(
         again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
         crossed = checked & pair.differs & ~again
 
-        found = Crossing(at.part(lo, hi, FRONT, mi.Bool(False)), pair.k)
+        found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh), pair.k)
         finds.write(slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
         front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, pair.chosen)
         kept, part = front.kept(mi.Bool(True), mi.Bool(False), narrowest)

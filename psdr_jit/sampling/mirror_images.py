@@ -105,6 +105,12 @@ class SeenBalls:
         return Cones.by_angle([ball.seen_from(x) for ball in self.balls])
 
 
+def lamp_balls(job: Job) -> list[SeenBall]:
+    """Around every shape that emits light."""
+    shapes = job.scene.shapes()
+    return [SeenBall.around([shapes[s.index]]) for s in job.facts.shapes if s.index >= 0 and s.is_emitter]
+
+
 def with_images(job: Job, balls: Sequence[SeenBall]) -> list[SeenBall]:
     """`balls`, and their images in the mirrors that rest: in one, then in two, and on, as many as are looked at."""
     mirrors, seen, latest = plane_mirrors(job), list(balls), list(balls)
