@@ -247,4 +247,5 @@ TERM = Term(
     forward=forward,
     backward=backward,
     over_film=True,
+    cost_of_segment=0.4,  # .15 to .46 where mirrors and glass are moved, by processor time
 )

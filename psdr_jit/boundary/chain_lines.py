@@ -76,6 +76,10 @@ class Lines(SearchedLines):
         """Expected number of lines of one direction across the pixel of a line."""
         return self.samples.in_pixel(sample) / 2
 
+    def tell_effort(self, sample: mi.UInt32, segments: mi.UInt32) -> None:
+        if self.job.effort is not None:
+            self.job.effort.append(self.samples.by_pixel(sample, segments))
+
     @property
     def count(self) -> int:
         """Number of lines."""

@@ -108,8 +108,8 @@ def begun(at: Interval) -> mi.UInt32:
 @dr.syntax
 def _searched(
     lines: SearchedLines, guesses: Guesses, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds
-) -> Search:
-    """Go on with searches until they pause or end; fills `finds`.
+) -> tuple[Search, mi.UInt32]:
+    """Go on with searches until they pause or end, `(searches, segments traced by each)`; fills `finds`.
 
     `pause`: the number of looks after which one does, and whether one does before it begins to halve; it then does not
     come back to what lies in front of crossings, either.
@@ -118,13 +118,14 @@ def _searched(
     stack, height = empty_stack(), mi.UInt32(0)
     least, narrowest = lines.least_width, lines.narrowest
     search = dr.select(mi.Bool(True), search, search)
-    looks, slot, active = mi.UInt32(0), mi.UInt32(0), search.mode != END
+    looks, slot, segments, active = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), search.mode != END
     while dr.hint(
         active, label="psdr.chain.search", exclude=[lines, guesses, finds, most_looks, before_halving, least]
     ):
         at, whole, halve = search.at, search.mode <= PROBE, search.mode == HALVE
         start, end = search.compared(least)
         pair = lines.compare(at.sample, (start, end))
+        segments += 2 * (pair.last + 1)
 
         apart, checked = whole & pair.differs & pair.specular, search.mode == CHECK
         first = halve & pair.differs & (pair.moves | ~search.moves)  # what moves is sought rather than what rests
@@ -160,7 +161,7 @@ def _searched(
         waits = (looks >= most_looks) | (slot == finds.slots)
         active = (mode != END) & ~(((mode <= PROBE) & waits) | (apart & before_halving))
     finds.write_rest(stack, height, search.at.sample)
-    return search
+    return search, segments
 
 
 def _joined(parts: list) -> Search | Crossing | None:
@@ -196,8 +197,9 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
         many = _width(left) > FEW
         finds = Finds(_width(left), 1 if many else SLOTS)
         pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
-        search = _searched(lines, guesses, left, pause, finds)
-        dr.eval(search, finds.crossing, finds.before, finds.found, finds.goes_on)
+        search, segments = _searched(lines, guesses, left, pause, finds)
+        dr.eval(search, segments, finds.crossing, finds.before, finds.found, finds.goes_on)
+        lines.tell_effort(left.at.sample, segments)
         found.append(compact(finds.crossing, finds.found))
         before = compact(finds.before, finds.goes_on)
         halving = (search.mode == HALVE) | (search.mode == CHECK)

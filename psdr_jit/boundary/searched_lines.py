@@ -58,6 +58,9 @@ class SearchedLines(ABC):
         guide(self.world, ray, self._numbers(sample), sampler, sample, self.directions)
         dr.eval(self.directions.data)
 
+    def tell_effort(self, sample: mi.UInt32, segments: mi.UInt32) -> None:  # noqa: B027 (not all lines are on the film)
+        """So many segments have been traced for the lines `sample`; for `Job.effort`."""
+
     def _numbers(self, sample: mi.UInt32):
         """What chooses lobes and the points at the other end, for all chains of a line."""
         return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)

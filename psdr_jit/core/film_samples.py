@@ -27,6 +27,9 @@ EVEN_SHARE = 0.25
 #: Noise, relative to the mean over the film, that pixels are believed to have on top: the pilot sees none in many.
 LEAST_NOISE = 0.02
 
+#: What a sample costs at least, relative to the mean over the film.
+LEAST_EFFORT = 0.1
+
 
 @dataclass(frozen=True)
 class FilmDensity:
@@ -36,9 +39,14 @@ class FilmDensity:
     levels: str  # the wishes, see `levels.packed`
 
     @staticmethod
-    def of(variance: np.ndarray) -> FilmDensity | None:
-        """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise."""
+    def of(variance: np.ndarray, effort: np.ndarray | None = None) -> FilmDensity | None:
+        """√(variance of each pixel), (H, W), with that of its neighbours; None where there is no noise.
+
+        `effort`, (H, W): what a sample costs there, which then is least for √(variance / effort); None: all the same.
+        """
         spread = np.sqrt(smoothed(np.asarray(variance, np.float64)))
+        if effort is not None:
+            spread /= np.sqrt(smoothed(np.maximum(effort, LEAST_EFFORT * effort.mean())))
         if not spread.mean() > 0 or not np.isfinite(spread).all():
             return None
         return FilmDensity(tuple(spread.shape), packed(spread / spread.mean() + LEAST_NOISE))
@@ -107,6 +115,13 @@ class FilmSamples:
         dr.scatter(begins, mi.UInt32(1), dr.gather(mi.UInt32, first, dr.arange(mi.UInt32, counts.size - 1) + 1))
         pixels = dr.cumsum(begins)
         return FilmSamples(even.corner, size, spp, first, pixels)
+
+    def by_pixel(self, lane: mi.UInt32, value: mi.UInt32) -> np.ndarray:
+        """(H, W) of the sampled window: sums of a `value` of each sample `lane`. Waits for them."""
+        columns, rows = self.size
+        sums = dr.zeros(mi.Float, columns * rows)
+        dr.scatter_add(sums, mi.Float(value), self.place(lane)[0])
+        return np.array(sums, np.float64).reshape(rows, columns)
 
     @property
     def count(self) -> int:

@@ -39,25 +39,33 @@ class FilmNoise:
 
     variance: np.ndarray  # (H, W), of one sample
     samples: float  # per pixel: how many have told
+    effort: np.ndarray | None = None  # (H, W), segments that a sample traces; None: all about the same
 
     @staticmethod
-    def of(images: Mapping[int, np.ndarray], count: int) -> FilmNoise:
+    def of(images: Mapping[int, np.ndarray], count: int, effort: np.ndarray | None = None) -> FilmNoise:
         """From variances (H, W) between `count` images, by their samples per pixel."""
         noise = [FilmNoise(spp * variance, (count - 1) * spp) for spp, variance in images.items()]
         total = sum(n.samples for n in noise)
-        return FilmNoise(_believed([(n.variance, n.samples / total) for n in noise]), total)
+        return FilmNoise(_believed([(n.variance, n.samples / total) for n in noise]), total, effort)
 
     @cached_property
     def density(self) -> FilmDensity | None:
         """Where samples are wanted; None: nowhere in particular."""
-        return FilmDensity.of(self.variance)
+        return FilmDensity.of(self.variance, self.effort)
+
+    @property
+    def segments(self) -> float:
+        """What a sample traces on average, spread by this density."""
+        there = self.density.expected if self.density is not None else np.ones_like(self.effort)
+        return float(np.mean(there * self.effort))
 
     def seen(self, variance: np.ndarray, spp: int, calls: int) -> FilmNoise:
         """With the mean variance (H, W) of `calls` images of `spp` samples per pixel, drawn by this density."""
         there = self.density.expected if self.density is not None else 1.0
         before = min(self.samples, calls * spp * (1 / FORGET - 1))
         new = calls * spp / (before + calls * spp)
-        return FilmNoise(_believed([(self.variance, 1 - new), (spp * there * variance, new)]), before + calls * spp)
+        variance = _believed([(self.variance, 1 - new), (spp * there * variance, new)])
+        return FilmNoise(variance, before + calls * spp, self.effort)
 
 
 def _believed(estimates: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:

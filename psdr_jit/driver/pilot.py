@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.film import sampled_window
 from ..core.line_guide import LineGuide, LineTally
 from ..plan.job import Job
 from .film_noise import FilmNoise, coarse
@@ -47,6 +48,7 @@ class TermNoise:
     at_more: float
     p: float
     cost: float
+    even_cost: float  # the same if paths are spread evenly over the film
     film: FilmNoise | None = None  # where it is noisy, if its samples are spread over the film
     lines: LineGuide | None = None  # which lines through edges are worth it, if it samples any
 
@@ -54,13 +56,18 @@ class TermNoise:
     def between(few: float, more: float, cost: float) -> TermNoise:
         """From the variances at `FEW` and `MORE` paths."""
         p = math.log(few / more) / math.log(MORE / FEW) if few > 0 and more > 0 else SLOWEST
-        return TermNoise(max(more, 0.0), min(max(p, SLOWEST), FASTEST), cost)
+        return TermNoise(max(more, 0.0), min(max(p, SLOWEST), FASTEST), cost, cost)
 
-    def spread(self, few: np.ndarray, more: np.ndarray) -> TermNoise:
+    def spread(self, few: np.ndarray, more: np.ndarray, effort: np.ndarray | None) -> TermNoise:
         """With samples where the film is noisy: as much better as one half of the pilot, (H, W), tells of the other."""
-        told = FilmNoise.of({FEW: few}, IMAGES).density
+        told = FilmNoise.of({FEW: few}, IMAGES, effort).density
         gain = max(1.0, told.gain(more)) if told is not None else 1.0
-        return replace(self, at_more=self.at_more / gain, film=FilmNoise.of({FEW: few, MORE: more}, IMAGES))
+        return replace(self, at_more=self.at_more / gain, film=FilmNoise.of({FEW: few, MORE: more}, IMAGES, effort))
+
+    def measured(self, cost_of_segment: float) -> TermNoise:
+        """With the cost of what its samples trace."""
+        even = float(self.film.effort.mean())
+        return replace(self, cost=cost_of_segment * self.film.segments, even_cost=cost_of_segment * even)
 
     def guided(self, few: LineTally, more: LineTally) -> TermNoise:
         """With lines as the pilot has found them worth; as much better as one half of it tells of the other."""
@@ -104,7 +111,7 @@ class Measurement:
     def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
         """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""
         terms = {name: self.noise[form][name] for name in self.noise[form] if name in names}
-        total = sum(t.cost * spp[name] for name, t in terms.items())
+        total = sum(t.even_cost * spp[name] for name, t in terms.items())
         if not any(t.at_more > 0 for t in terms.values()):
             return dict(spp)
 
@@ -134,20 +141,32 @@ def measure(
         found[form] = {}
         for term in (t for t in TERMS if t.name in names):
             tallies = {spp: LineTally() if term.through_edges else None for spp in (FEW, MORE)}
+            traced = [] if term.cost_of_segment is not None else None
             few, more = (
-                _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally))
+                _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally, effort=traced))
                            for k in range(IMAGES)])
                 for spp, tally in tallies.items()
             )  # fmt: skip
-            lit = job_of(form, FIRST_SEED, FEW).light is not None
-            cost = term.cost(form, sky) * (term.with_light if lit else 1)
+            job = job_of(form, FIRST_SEED, FEW)
+            cost = term.cost(form, sky) * (term.with_light if job.light is not None else 1)
             noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
             if term.over_film:
-                noise = noise.spread(few, more)
+                noise = noise.spread(few, more, _effort(traced, job) if traced else None)
+            if traced:
+                noise = noise.measured(term.cost_of_segment * cost / term.cost(form, sky))
             if term.through_edges:
                 noise = noise.guided(tallies[FEW], tallies[MORE])
             found[form][term.name] = noise
     return Measurement(found)
+
+
+def _effort(traced: list[np.ndarray], job: Job) -> np.ndarray:
+    """What a sample traces, by pixel or block of pixels, (H, W) [segments]. `traced`: by all of a pilot together."""
+    lower, _ = sampled_window(job.film)
+    columns, rows = job.film.crop_size()
+    left, top = (int(n) for n in job.film.crop_offset() - lower)
+    total = sum(traced)[top : top + rows, left : left + columns]
+    return coarse(total / ((FEW + MORE) * IMAGES))
 
 
 def variance_of_pair(a: mi.TensorXf, b: mi.TensorXf) -> mi.TensorXf:

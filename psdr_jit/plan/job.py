@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
+import numpy as np
 
 from ..core.film import filter_reach
 from ..core.film_samples import FilmDensity
@@ -51,6 +52,7 @@ class Job:
     density: FilmDensity | None = None  # where on the film samples of this term are wanted; None: everywhere
     guide: LineGuide | None = None  # which lines through edges are; None: all alike
     tally: LineTally | None = None  # wants to know what lines bring
+    effort: list[np.ndarray] | None = None  # gets what is traced for each pixel of the sampled window [segments]
 
     @property
     def scene(self) -> mi.Scene:

@@ -48,3 +48,4 @@ class Term:
     through_edges: bool = False  # its samples are lines through edges that can be guided
     with_light: float = 1.0  # factor on the cost where light subpaths run
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy
+    cost_of_segment: float | None = None  # as `cost`, if samples tell how much they trace (`Job.effort`)

@@ -33,6 +33,9 @@ class Striped:
 
     least_width = property(lambda self: mi.Float(2.0**-12))
 
+    def tell_effort(self, sample: mi.UInt32, segments: mi.UInt32) -> None:
+        """Nobody asks."""
+
     def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> Pair:
         start = dr.gather(mi.Float, self.start, sample)
         inside = [(s > start) & (s < start + self.width) for s in ends]

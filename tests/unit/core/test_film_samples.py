@@ -35,6 +35,22 @@ def test_every_pixel_has_its_share_and_the_noisy_ones_the_rest(llvm):
     assert counts[:2, :2].min() > 3 * SPP
 
 
+def test_fewer_where_a_sample_is_dear(llvm):
+    """n ∝ √(variance / cost), but for the even share."""
+    effort = np.ones((HEIGHT, WIDTH))
+    effort[:, WIDTH // 2 :] = 16.0
+    even = FilmDensity.of(np.ones_like(effort)).expected
+    left, right = FilmDensity.of(np.ones_like(effort), effort).expected[:, [0, -1]].T
+    assert np.allclose(even, 1, atol=0.01)
+    assert np.allclose((left - EVEN_SHARE) / (right - EVEN_SHARE), 4, rtol=0.1)
+
+
+def test_sums_by_pixel(llvm):
+    samples = FilmSamples.over(film(), SPP, noisy_corner())
+    lane = dr.arange(mi.UInt32, samples.count)
+    assert (samples.by_pixel(lane, mi.UInt32(1)) == counts_of(samples)).all()
+
+
 def test_text_and_back(llvm):
     """Another process that is given the text draws the same numbers of samples."""
     density = noisy_corner()

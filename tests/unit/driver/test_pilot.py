@@ -34,7 +34,7 @@ def scene_of(name: str, **defaults) -> mi.Scene:
 
 def noise(**terms: tuple[float, float, float]) -> Measurement:
     """Of the spatial form; (variance at `pilot.MORE` paths, p, cost) by term."""
-    return Measurement({"spatial": {name: TermNoise(*t) for name, t in terms.items()}})
+    return Measurement({"spatial": {name: TermNoise(*t, even_cost=t[2]) for name, t in terms.items()}})
 
 
 # ------------------------------------------------------------------------------------------ the optimisation
@@ -64,6 +64,16 @@ def test_nothing_nearby_is_better(p):
             measured.noise["spatial"][k].cost * other[k] for k in best
         )
         assert measured.efficiency("spatial", {k: n * scale for k, n in other.items()}) >= 0.995 * least
+
+
+def test_the_total_is_that_of_samples_spread_evenly():
+    """A term whose noisy pixels are costly takes from the others; it does not make the whole dearer."""
+    even = noise(chain=(1.0, 1.0, 4.0), interior=(1.0, 1.0, 1.0)).noise["spatial"]
+    measured = Measurement({"spatial": {**even, "chain": replace(even["chain"], cost=16.0)}})
+    spp = {"chain": 100, "interior": 100}
+    n = measured.allocate("spatial", spp, spp)
+    assert 16 * n["chain"] + n["interior"] == pytest.approx(5 * 100, rel=0.03)
+    assert n["interior"] == pytest.approx(4 * n["chain"], rel=0.06)  # √(V/C)
 
 
 def both(n: int) -> tuple:
@@ -168,6 +178,17 @@ def test_automatic_budgets_cost_as_much_as_equal_ones(llvm):
             integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 4, **explicit})
             plan = prepare(integrator.call(scene, scene.sensors()[0], 0, 32)).plan
             assert {t.spp for t in plan.running} == {32}
+
+
+def test_lines_across_mirrors_tell_what_they_trace(llvm):
+    """What lines trace is counted by the pixel they begin in, and their noisy pixels are dearer than the mean."""
+    scene = scene_of("mirrors")
+    with also_enabled(scene, ["mirror.to_world"]):
+        integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3})
+        ready = prepare(integrator.call(scene, scene.sensors()[0], 0, 8))
+    noise = ready.log.current.noise[ready.plan.form]["chain"]
+    assert noise.film.effort.shape == (16, 16) and noise.cost > noise.even_cost > 0
+    assert noise.film.effort.min() >= 2 and noise.film.effort.max() > 4 * noise.film.effort.min()
 
 
 def test_forward_and_backward_mode_share_the_plan(variant):
