@@ -136,6 +136,17 @@ def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> m
     return image / _pixel_mass(film)
 
 
+def boundary_adjoint(film: mi.Film, p: mi.Point2f, grad_in: mi.TensorXf, wavelengths) -> mi.Spectrum:
+    """Adjoint of `develop_boundary`: derivative of ⟨grad_in, image⟩ with respect to each value."""
+    with dr.resume_grad():
+        value = dr.zeros(mi.Spectrum, dr.width(p))
+        dr.enable_grad(value)
+        backpropagate(develop_boundary(film, p, value, mi.Float(0), wavelengths, mi.Bool(True)), grad_in)
+        adjoint = dr.grad(value)
+    clear(film)
+    return adjoint
+
+
 def develop_channels(film: mi.Film, names: list[str], at: FilmPoints, values: list[mi.Float]) -> mi.TensorXf:
     """`develop_samples` of other channels than radiance: (H, W, K), attached where `values` are."""
     return _channels(film, names, at.p, (values, at.weight), (at.weight, mi.Bool(True), at.coalesce))

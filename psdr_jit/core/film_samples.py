@@ -157,6 +157,18 @@ class FilmSamples:
         pixel = dr.gather(mi.UInt32, self.pixels, lane)
         return mi.Float(dr.gather(mi.UInt32, self.first, pixel + 1) - dr.gather(mi.UInt32, self.first, pixel))
 
+    def at(self, p: mi.Point2f) -> mi.Float:
+        """Number of samples of the pixel around the film position `p` [px]; 0 outside of the sampled window."""
+        place = dr.floor(p - varying(mi.Point2f, self.corner))
+        width, height = (varying(mi.Float, n) for n in self.size)
+        inside = (place.x >= 0) & (place.y >= 0) & (place.x < width) & (place.y < height)
+        count = varying(mi.Float, self.spp)
+        if self.pixels is not None:
+            pixel = mi.UInt32(place.y) * mi.UInt32(width) + mi.UInt32(place.x)
+            last = dr.gather(mi.UInt32, self.first, pixel + 1, inside)
+            count = mi.Float(last - dr.gather(mi.UInt32, self.first, pixel, inside))
+        return dr.select(inside, count, 0)
+
     def weight(self) -> mi.Float:
         """Of every sample, for means: 1 on average over the film."""
         if self.pixels is None:

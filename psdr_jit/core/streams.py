@@ -33,6 +33,8 @@ class Stream(IntEnum):
     LIGHT_SUBPATH = 19
     LIGHT_CHAIN = 20
     LIGHT_CHAIN_PILOT = 21
+    SPHERE_RIMS = 22
+    SPHERE_RIM_PATHS = 23
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -16,7 +16,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.memory import Memory
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
-from ..interior.term import CameraPass, camera_passes
+from ..interior.camera_pass import CameraPass, camera_passes
 from ..options import samples_per_pixel
 from ..paths.bounce import PathLimits
 from ..paths.light_walk import trace_light

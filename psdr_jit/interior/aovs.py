@@ -12,7 +12,7 @@ from ..core.ad import backpropagate, tangents
 from ..paths.aovs import Aovs
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
-from .term import camera_passes
+from .camera_pass import camera_passes
 
 
 def _images(job: Job, aovs: Aovs) -> Iterator[mi.TensorXf]:

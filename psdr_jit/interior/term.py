@@ -7,26 +7,21 @@ Where that has turned out to be most of them, an integrator no longer looks.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core import film as films
 from ..core.ad import accumulate
-from ..core.camera_rays import camera_rays
-from ..core.film_samples import FilmSamples
-from ..core.low_discrepancy import LaneSampler
 from ..core.memory import Slot
-from ..core.streams import Stream, stream_seed
+from ..core.streams import Stream
 from ..edges.followed_lights import followed_lights
 from ..options import Options
 from ..paths.dry_walk import count_vertices, touches
 from ..paths.recording import PathRecords
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.walk import PathLimits, first_hit, walk
-from ..plan.job import Job, passes
+from ..plan.job import Job
 from ..plan.plan import Geometry
 from ..plan.probe_motion import registry_table
 from ..plan.reasons import what_changes
@@ -34,60 +29,22 @@ from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_traced
 from .along_walk import MaterialTangents, RadianceTangents
+from .camera_pass import CameraPass, camera_passes
 from .flow import Flow, SceneTraits
 from .material import MaterialFlow
 from .resting import RestingFlow
 from .spatial import SpatialFlow
+from .sphere_rims import RimPass, SphereRims, with_rims
 from .sweeps import backward_sweep, forward_sweep
 
 #: What vertices do from the second on, by form: slide along their rays, or stay on their material.
 FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow}
-
-#: Samples per pixel from which the film adds up those of a pixel before it writes.
-COALESCED = 4
-
-#: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
-NOMINAL_DEPTH = 16
-
 
 #: Share of the paths that had a derivative when they were looked for last, by an integrator.
 TOUCHED_SHARE: Slot[float] = Slot(float)
 
 #: Share of paths with a derivative from which looking for them costs more than it saves; the others contribute 0.
 MOST_PATHS = 0.6
-
-
-@dataclass(frozen=True)
-class CameraPass:
-    """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
-
-    samples: FilmSamples
-    share: float  # of the term's samples
-    seed: mi.UInt32
-    ray: mi.RayDifferential3f
-    weight: mi.Spectrum
-    at: films.FilmPoints
-
-    def sampler(self, lane: mi.UInt32) -> LaneSampler:
-        """What is random about the paths of these samples."""
-        return self.samples.sampler(self.seed, lane)
-
-
-def camera_passes(job: Job) -> Iterator[CameraPass]:
-    """Camera rays, in passes whose path records fit into `record_mib`."""
-    film = job.film
-    lower, upper = films.sampled_window(film)
-    pixels = int((upper - lower).prod())
-    depth = max(1, min(job.options.depth_limit, NOMINAL_DEPTH))
-    size = PathRecords.BYTES_RGB * depth * (1 if job.light is None else 1 + job.plan.light.per_sample)
-    for share, part in passes(job, size, pixels):
-        films.clear(film)
-        samples = FilmSamples.over(film, part.spp, part.density)
-        lane = dr.arange(mi.UInt32, samples.count)
-        rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
-        ray, weight, p = camera_rays(job.sensor, samples, rng, lane)
-        at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
-        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at)
 
 
 def every_path_differs(job: Job) -> bool:
@@ -136,16 +93,17 @@ def _along_the_walk(job: Job, p: CameraPass) -> mi.Spectrum:
     return job.call.counters.rejected.keep_finite(sink.dL)
 
 
-def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
+def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
     """Trace the paths of a pass that can have a derivative; returns their records and their lanes."""
     facts, limits = job.facts, _limits(job)
     if limits.max_depth == 0:
         return PathRecords(0, 0), mi.UInt32()
     ray = mi.Ray3f(dr.detach(p.ray))
-    lane = dr.arange(mi.UInt32, p.samples.count)
+    lane = dr.arange(mi.UInt32, p.count)
     dr.eval(ray, lane)
 
-    if not every_path_differs(job) and job.call.memory[TOUCHED_SHARE] < MOST_PATHS:
+    looks = not (p.sought or every_path_differs(job))
+    if looks and job.call.memory[TOUCHED_SHARE] < MOST_PATHS:
         sampler = p.sampler(lane)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         lane = dr.compress(found)
@@ -160,6 +118,7 @@ def _record(job: Job, p: CameraPass) -> tuple[PathRecords, mi.UInt32]:
     records = PathRecords(dr.width(lane), depth)
     ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
     sampler = p.sampler(lane)
+    dr.eval(sampler)  # for one kernel, whatever the samples are of
     _, records.count, _ = walk(
         job.scene, sampler, ray, pi, replace(limits, max_depth=depth), records, emission, mi.Bool(True)
     )
@@ -184,7 +143,7 @@ def flow_of(job: Job) -> Flow:
     return FLOWS[job.form](job.scene, traits)
 
 
-def _skipped(job: Job, p: CameraPass, records: PathRecords) -> mi.Float:
+def _skipped(job: Job, p: CameraPass | RimPass, records: PathRecords) -> mi.Float:
     """How far the recorded camera rays start beyond the sensor's own: behind hidden emitters, 0 otherwise [m]."""
     if not job.options.hide_emitters:
         return mi.Float(0)
@@ -192,12 +151,12 @@ def _skipped(job: Job, p: CameraPass, records: PathRecords) -> mi.Float:
     return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
 
 
-def _derivatives(job: Job, p: CameraPass) -> mi.Spectrum:
+def _derivatives(job: Job, p: CameraPass | RimPass) -> mi.Spectrum:
     """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
     if paths_rest(job):
         return _along_the_walk(job, p)
     records, lane = _record(job, p)
-    dL = dr.zeros(mi.Spectrum, p.samples.count)
+    dL = dr.zeros(mi.Spectrum, p.count)
     if dr.width(lane) > 0:
         o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
         if job.facts.camera_moves:
@@ -213,9 +172,10 @@ def forward(job: Job) -> mi.TensorXf:
     """Derivative image of the interior term along the tangents set on the scene's parameters. Detached."""
     image = 0
     with dr.suspend_grad():
+        rims = None if paths_rest(job) else SphereRims.of(job)
         for p in camera_passes(job):
-            dL = _derivatives(job, p)
-            image += p.share * films.develop_samples(job.film, p.at, dL * p.weight, p.ray.wavelengths)
+            for part in with_rims(rims, p):
+                image += p.share * part.develop(job.film, _derivatives(job, part))
             found = _from_light(job, p)
             if found is not None:
                 image += p.share * light_traced.forward(job, found, flow_of(job))
@@ -230,24 +190,30 @@ def _from_light(job: Job, p: CameraPass) -> light_traced.LightTraced | None:
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
     """Accumulate the interior term's ⟨grad_in, dI⟩ into the attached parameters."""
     with dr.suspend_grad():
+        rims = None if paths_rest(job) else SphereRims.of(job)
         for p in camera_passes(job):
             found = _from_light(job, p)
             if found is not None:
                 light_traced.backward(job, found, flow_of(job), p.share * grad_in)
-            records, lane = _record(job, p)
-            if dr.width(lane) == 0:
-                continue
-            δL = p.share * p.weight * films.sample_adjoint(job.film, p.at, grad_in, p.ray.wavelengths)
-            δL = dr.gather(mi.Spectrum, δL, lane)
-            λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
-            if job.facts.camera_moves:
-                λ_d = λ_d + _skipped(job, p, records) * λ_o
-                # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
-                dr.eval(λ_o, λ_d)
-                with dr.resume_grad():
-                    adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
-                    accumulate(adjoint)  # other terms need the sensor's edges
-            dr.eval()
+            for part in with_rims(rims, p):
+                _accumulate_adjoint(job, part, p.share, grad_in)
+
+
+def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in: mi.TensorXf) -> None:
+    """Accumulate what `share` of a pass adds to ⟨grad_in, dI⟩."""
+    records, lane = _record(job, p)
+    if dr.width(lane) == 0:
+        return
+    δL = dr.gather(mi.Spectrum, share * p.adjoint(job.film, grad_in), lane)
+    λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
+    if job.facts.camera_moves:
+        λ_d = λ_d + _skipped(job, p, records) * λ_o
+        # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
+        dr.eval(λ_o, λ_d)
+        with dr.resume_grad():
+            adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
+            accumulate(adjoint)  # other terms need the sensor's edges
+    dr.eval()
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
@@ -264,7 +230,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 TERM = Term(
     name="interior",
     budget="sppc",
-    streams=(Stream.CAMERA, Stream.INTERIOR, Stream.LIGHT_SUBPATH),
+    streams=(Stream.CAMERA, Stream.INTERIOR, Stream.LIGHT_SUBPATH, Stream.SPHERE_RIMS, Stream.SPHERE_RIM_PATHS),
     needed=needed,
     cost=lambda form, sky: 1.0,
     with_light=3.0,  # 2.5 to 5.6 by processor time: a spot moved, glass moved, an index, 64² and 16²

@@ -1,0 +1,71 @@
+"""Samples of the film, with their camera rays, in passes whose records fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core import film as films
+from ..core.camera_rays import camera_rays
+from ..core.film_samples import FilmSamples
+from ..core.low_discrepancy import LaneSampler
+from ..core.streams import Stream, stream_seed
+from ..paths.recording import PathRecords
+from ..plan.job import Job, passes
+
+#: Samples per pixel from which the film adds up those of a pixel before it writes.
+COALESCED = 4
+
+#: Recorded depth assumed for unlimited paths when the wavefront is split; the actual depth is measured.
+NOMINAL_DEPTH = 16
+
+
+@dataclass(frozen=True)
+class CameraPass:
+    """Camera samples of one pass; `ray` is attached to the sensor, everything else detached."""
+
+    samples: FilmSamples
+    share: float  # of the term's samples
+    seed: mi.UInt32
+    ray: mi.RayDifferential3f
+    weight: mi.Spectrum
+    at: films.FilmPoints
+
+    sought = False  # which of them meet what moves is not known
+
+    @property
+    def count(self) -> int:
+        """Number of samples."""
+        return self.samples.count
+
+    def sampler(self, lane: mi.UInt32) -> LaneSampler:
+        """What is random about the paths of these samples."""
+        return self.samples.sampler(self.seed, lane)
+
+    def develop(self, film: mi.Film, value: mi.Spectrum) -> mi.TensorXf:
+        """Image of what the samples bring."""
+        return films.develop_samples(film, self.at, value * self.weight, self.ray.wavelengths)
+
+    def adjoint(self, film: mi.Film, grad_in: mi.TensorXf) -> mi.Spectrum:
+        """Of `develop`: derivative of ⟨grad_in, image⟩ with respect to each value."""
+        return self.weight * films.sample_adjoint(film, self.at, grad_in, self.ray.wavelengths)
+
+
+def camera_passes(job: Job) -> Iterator[CameraPass]:
+    """Camera rays, in passes whose path records fit into `record_mib`."""
+    film = job.film
+    lower, upper = films.sampled_window(film)
+    pixels = int((upper - lower).prod())
+    depth = max(1, min(job.options.depth_limit, NOMINAL_DEPTH))
+    size = PathRecords.BYTES_RGB * depth * (1 if job.light is None else 1 + job.plan.light.per_sample)
+    for share, part in passes(job, size, pixels):
+        films.clear(film)
+        samples = FilmSamples.over(film, part.spp, part.density)
+        lane = dr.arange(mi.UInt32, samples.count)
+        rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
+        ray, weight, p = camera_rays(job.sensor, samples, rng, lane)
+        at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
+        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at)
