@@ -139,13 +139,13 @@ class SphereRims:
         sin_φ, cos_φ = dr.sincos(dr.two_pi * u.y)
         ω = mi.Frame3f(axis / d).to_world(mi.Vector3f(sin * cos_φ, sin * sin_φ, cos))
         x = mi.Point3f(o + (d * cos - r * cos_θ) * ω)
-        view = look_at(frame, x, numbers.aperture)
+        p = look_at(frame, x, numbers.aperture).p
 
-        n_film = samples.at(view.p)
-        valid = (d > r) & view.valid & (n_film > 0)
-        ray = mi.Ray3f(dr.detach(rays_at(sensor, view.p, numbers)[0]))
+        n_film = samples.at(p)
+        valid = (d > r) & ((frame.to_local @ x).z > 0) & (n_film > 0)  # the near plane may cut a sphere open
+        ray = mi.Ray3f(dr.detach(rays_at(sensor, p, numbers)[0]))
         met, n_rim = self._met(ray, n, valid)
-        kept = compact(_Place(view.p, numbers, dr.rcp(n_film + n_rim)), valid & (met == k + 1))
+        kept = compact(_Place(p, numbers, dr.rcp(n_film + n_rim)), valid & (met == k + 1))
         if kept is None:
             return None
         ray, weight = rays_at(sensor, kept.p, kept.numbers)
@@ -175,7 +175,7 @@ class SphereRims:
         pdf_sa = pdf_sφ * 2 * d * along / dr.square(r)  # d² cosθ' = d · along
         x = mi.Point3f(ray(along))
         per_px = pixel_footprint(frame, x, ray.d) / dr.squared_norm(x - o)
-        among &= (cos_θ > GRAZING) & (cos_θ < MOST_COS)
+        among &= (d > r) & (cos_θ > GRAZING) & (cos_θ < MOST_COS)
         return dr.select(among, number, 0), dr.select(among, varying(mi.Float, n / self.count) * pdf_sa * per_px, 0)
 
 

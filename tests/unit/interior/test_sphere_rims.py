@@ -23,6 +23,7 @@ WIDTH, HEIGHT, SPP = 24, 20, 8192
 CAMERAS = {
     "pinhole": {"type": "perspective"},
     "lens": {"type": "thinlens", "aperture_radius": 0.15, "focus_distance": 4.0},
+    "cut": {"type": "perspective", "near_clip": 3.2},  # the near plane runs through two balls
 }
 
 FILMS = {
@@ -74,6 +75,19 @@ def test_both_kinds_of_samples_add_up(camera, film, llvm):
             taken, error2 = taken + weight.sum(), error2 + np.square(weight).sum()
     assert given > 1 and error2 < (0.01 * given) ** 2  # [px]
     assert abs(taken - given) < 3 * np.sqrt(error2)
+
+
+def test_a_ball_around_the_camera_has_no_rim(llvm):
+    """Rays that leave it may be all but tangent to it."""
+    scene = balls(CAMERAS["pinhole"], FILMS["whole"])
+    params = mi.traverse(scene)
+    params["before.to_world"] = mi.Transform4f().translate([4.1, 0.3, 4.0]).scale(4.2)
+    params.update()
+    job = job_of(scene, "before.to_world", 4)
+    with dr.suspend_grad():
+        (p,) = camera_pass.camera_passes(job)
+        assert dr.all(SphereRims.of(job).left_to_film(p.samples, mi.Ray3f(dr.detach(p.ray))) == 1)
+        assert SphereRims.of(job).sample(p.samples, p.seed) is None
 
 
 def test_only_what_slides_has_rims(llvm):
