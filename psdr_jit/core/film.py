@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -74,10 +75,17 @@ def develop_samples(
 
 def sample_adjoint(film: mi.Film, at: FilmPoints, grad_in: mi.TensorXf, wavelengths) -> mi.Spectrum:
     """Adjoint of `develop_samples`: derivative of ⟨grad_in, image⟩ with respect to each sample's value."""
+    return _adjoint(film, dr.width(at.p), grad_in, lambda value: develop_samples(film, at, value, wavelengths))
+
+
+def _adjoint(
+    film: mi.Film, count: int, grad_in: mi.TensorXf, develop: Callable[[mi.Spectrum], mi.TensorXf]
+) -> mi.Spectrum:
+    """Derivative of ⟨grad_in, develop(value)⟩ with respect to each of `count` values."""
     with dr.resume_grad():
-        value = dr.zeros(mi.Spectrum, dr.width(at.p))
+        value = dr.zeros(mi.Spectrum, count)
         dr.enable_grad(value)
-        backpropagate(develop_samples(film, at, value, wavelengths), grad_in)
+        backpropagate(develop(value), grad_in)
         adjoint = dr.grad(value)
     clear(film)
     return adjoint
@@ -138,13 +146,11 @@ def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> m
 
 def boundary_adjoint(film: mi.Film, p: mi.Point2f, grad_in: mi.TensorXf, wavelengths) -> mi.Spectrum:
     """Adjoint of `develop_boundary`: derivative of ⟨grad_in, image⟩ with respect to each value."""
-    with dr.resume_grad():
-        value = dr.zeros(mi.Spectrum, dr.width(p))
-        dr.enable_grad(value)
-        backpropagate(develop_boundary(film, p, value, mi.Float(0), wavelengths, mi.Bool(True)), grad_in)
-        adjoint = dr.grad(value)
-    clear(film)
-    return adjoint
+
+    def develop(value: mi.Spectrum) -> mi.TensorXf:
+        return develop_boundary(film, p, value, mi.Float(0), wavelengths, mi.Bool(True))
+
+    return _adjoint(film, dr.width(p), grad_in, develop)
 
 
 def develop_channels(film: mi.Film, names: list[str], at: FilmPoints, values: list[mi.Float]) -> mi.TensorXf:

@@ -148,12 +148,12 @@ def measure(
                 for spp, tally in tallies.items()
             )  # fmt: skip
             job = job_of(form, FIRST_SEED, FEW)
-            cost = term.cost(form, sky) * (term.with_light if job.light is not None else 1)
-            noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
+            dearer = term.with_light if job.light is not None else 1
+            noise = TermNoise.between(float(few.mean()), float(more.mean()), dearer * term.cost(form, sky))
             if term.over_film:
                 noise = noise.spread(few, more, _effort(traced, job) if traced else None)
             if traced:
-                noise = noise.measured(term.cost_of_segment * cost / term.cost(form, sky))
+                noise = noise.measured(dearer * term.cost_of_segment)
             if term.through_edges:
                 noise = noise.guided(tallies[FEW], tallies[MORE])
             found[form][term.name] = noise
