@@ -15,8 +15,8 @@ from ..edges.kind import Use
 from ..paths.bounce import PathLimits
 from ..paths.scattering import Aim
 from ..plan.job import Job
-from ..plan.probe_motion import registry_table
 from ..sampling.relevance import Movers, movers_of
+from ..scene.registry import registry_table
 
 
 @dataclass(frozen=True)

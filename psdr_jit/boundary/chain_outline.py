@@ -27,7 +27,7 @@ from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transf
 from ..edges.points import LEAST_SLANT, clear_of_lift
 from ..plan.job import Job
 from ..plan.motion import Displacements
-from ..plan.probe_motion import registry_values
+from ..scene.registry import registry_values
 from .chain_patterns import INSET, NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
 

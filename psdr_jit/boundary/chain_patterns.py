@@ -21,8 +21,8 @@ from ..edges.scene_patterns import steps_of
 from ..edges.seams import charts
 from ..edges.segments import known_topology
 from ..plan.job import Job
-from ..plan.probe_motion import registry_values
 from ..scene.facts import ShapeFacts
+from ..scene.registry import registry_values
 
 #: Number of no family.
 NO_FAMILY = 0

@@ -25,7 +25,7 @@ from ..core.records import Hit
 from ..core.varying import varying
 from ..edges.followed_lights import FollowedLights, followed_lights
 from ..plan.job import Job
-from ..plan.probe_motion import registry_table
+from ..scene.registry import registry_table
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps

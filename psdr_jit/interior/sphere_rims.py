@@ -36,7 +36,7 @@ from ..core.varying import varying
 from ..edges.curves import attached_to_world
 from ..paths.recording import GRAZING
 from ..plan.job import Job
-from ..plan.probe_motion import registry_values
+from ..scene.registry import registry_values
 from .camera_pass import CameraPass
 
 #: cosθ up to which there are samples: the outer 8 % of a sphere's radius. What is met more edge-on than `GRAZING` has

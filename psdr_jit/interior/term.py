@@ -23,10 +23,10 @@ from ..paths.scattering import UNIFORM_SHARE
 from ..paths.walk import PathLimits, first_hit, walk
 from ..plan.job import Job
 from ..plan.plan import Geometry
-from ..plan.probe_motion import registry_table
 from ..plan.reasons import what_changes
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
+from ..scene.registry import registry_table
 from . import light_traced
 from .along_walk import MaterialTangents, RadianceTangents
 from .camera_pass import CameraPass, camera_passes

@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..core.curve_frame import turns
 from ..core.tube_axis import Axis
 from ..scene.tubes import Splines, Tubes
+from .cylinder_surface import cylinder_surface
 from .ellipsoid_surface import ellipsoid_surface
 from .grid_surface import grid_surface
 from .own_surface import of_hit, on_ray, where_active
@@ -36,6 +37,8 @@ def surface_at(
         return pi.compute_surface_interaction(ray, flags, active)
     families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
     families += [(grid, grid_surface) for grid in tubes.grids]
+    if tubes.cylinders is not None and (dr.grad_enabled(ray) or tubes.cylinders.attached()):
+        families.append((tubes.cylinders, cylinder_surface))
     met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
     elsewhere = mi.Bool(active)  # a copy: the caller's mask is not ours to change
     for *_, on_curve in met:

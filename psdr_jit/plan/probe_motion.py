@@ -6,7 +6,7 @@ how noisy they are is therefore measured for this motion (`driver.pilot`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from ..core.records import Hit
 from ..core.varying import varying
 from ..paths.tube_surface import surface_at
 from ..scene.facts import SceneFacts
-from ..scene.instances import is_instance
+from ..scene.registry import registry_table
 from ..scene.tubes import Tubes
 from .motion import Displacements, Motion
 
@@ -146,19 +146,3 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None)
         varying(mi.Vector3f, turn),
         tubes,
     )
-
-
-def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
-    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`; −1: every instance."""
-    if -1 in chosen:
-        chosen = chosen | {k for k, shape in enumerate(scene.shapes()) if is_instance(shape)}
-    return registry_values(scene, {index: 1 for index in chosen if index >= 0})
-
-
-def registry_values(scene: mi.Scene, values: Mapping[int, int]) -> mi.UInt32:
-    """By registry index of a shape: the value given for its number in `scene.shapes()`, or 0."""
-    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
-    table = [0] * (max(ids, default=0) + 1)
-    for index, value in values.items():
-        table[ids[index]] = value
-    return mi.UInt32(table)

@@ -21,7 +21,8 @@ from ..core.rod import Rod
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
 from .facts import SceneFacts, ShapeFacts
-from .grids import MovingGrid, moving_grids
+from .grids import TO_WORLD, MovingGrid, moving_grids
+from .registry import registry_table
 
 T = TypeVar("T", bound="Segments")
 
@@ -114,6 +115,23 @@ class Ellipsoids(Segments):
 
 
 @dataclass(frozen=True)
+class Cylinders:
+    """Cylinders: which shapes they are."""
+
+    moving: tuple[mi.Shape, ...]  # those with a pose that is differentiated
+    among: mi.UInt32  # by registry index of a shape: 1 if it is one
+
+    def segment(self, pi: mi.PreliminaryIntersection3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """Number of what was met, which does not matter, and whether it is one of them."""
+        shape = dr.reinterpret_array(mi.UInt32, pi.shape)
+        return pi.prim_index, active & (dr.gather(mi.UInt32, self.among, shape, active) != 0)
+
+    def attached(self) -> bool:
+        """Does one of them move, here and now?"""
+        return any(dr.grad_enabled(mi.traverse(shape)[TO_WORLD]) for shape in self.moving)
+
+
+@dataclass(frozen=True)
 class Tubes:
     """The curves of a scene, and what else has a surface that is not Mitsuba's to evaluate."""
 
@@ -121,18 +139,28 @@ class Tubes:
     rods: Rods | None
     grids: list[MovingGrid]
     ellipsoids: Ellipsoids | None
+    cylinders: Cylinders | None
 
 
 def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
-    """The curves and moving grids of `scene`; None if there are none."""
+    """The curves, cylinders and moving grids of `scene`; None if there are none."""
     curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
     grids = moving_grids(scene, facts, memory)
     ellipsoids = [s for s in facts.shapes if s.kind == "ellipsoids" and s.index >= 0]
-    if not curves and not grids and not ellipsoids:
+    cylinders = [s for s in facts.shapes if s.plugin == "cylinder" and s.index >= 0]
+    if not curves and not grids and not ellipsoids and not cylinders:
         return None
     of = {plugin: [s for s in curves if s.plugin == plugin] for plugin in ("bsplinecurve", "linearcurve")}
     return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids,
-                 _table(Ellipsoids, scene, ellipsoids))  # fmt: skip
+                 _table(Ellipsoids, scene, ellipsoids), _cylinders(scene, cylinders))  # fmt: skip
+
+
+def _cylinders(scene: mi.Scene, chosen: list[ShapeFacts]) -> Cylinders | None:
+    """The shapes `chosen`; None if there are none."""
+    if not chosen:
+        return None
+    moving = tuple(scene.shapes()[s.index] for s in chosen if s.moves)
+    return Cylinders(moving, registry_table(scene, {s.index for s in chosen}))
 
 
 def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | None:

@@ -1,0 +1,26 @@
+"""Tables that lanes look up by the registry index of the shape that they have met."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+
+from .instances import is_instance
+
+
+def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
+    """By registry index of a shape: 1 if its number in `scene.shapes()` is among `chosen`; −1: every instance."""
+    if -1 in chosen:
+        chosen = chosen | {k for k, shape in enumerate(scene.shapes()) if is_instance(shape)}
+    return registry_values(scene, {index: 1 for index in chosen if index >= 0})
+
+
+def registry_values(scene: mi.Scene, values: Mapping[int, int]) -> mi.UInt32:
+    """By registry index of a shape: the value given for its number in `scene.shapes()`, or 0."""
+    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+    table = [0] * (max(ids, default=0) + 1)
+    for index, value in values.items():
+        table[ids[index]] = value
+    return mi.UInt32(table)
