@@ -66,13 +66,12 @@ def of_both(scene: mi.Scene, ray: mi.Ray3f, how: dict, ray_moves: bool) -> tuple
 def test_distances_are_those_of_the_tangent_plane(llvm):
     """Down to small cosines; Mitsuba's own would not pass."""
     (ours, mitsuba), cos_θ, _ = of_both(thin_cylinder(), rays(100 * RADIUS), {"direction": SHIFT}, False)
-    n = ours[FIELDS.index("n")][0]
-    expected = (n * np.array(SHIFT)[:, None]).sum(0) / cos_θ
-    seen = np.abs(cos_θ) > GRAZING
-    edge_on = seen & (np.abs(cos_θ) < 0.03)
+    along = (ours[FIELDS.index("n")][0] * np.array(SHIFT)[:, None]).sum(0)  # the normal
+    error, power = (np.abs(cos_θ * of[0][1][0] - along) for of in (ours, mitsuba))
+    edge_on = (np.abs(cos_θ) > GRAZING) & (np.abs(cos_θ) < 0.03)
     assert edge_on.sum() > 100
-    assert (np.abs(cos_θ * ours[0][1][0] / expected - cos_θ))[seen].max() < 1e-4  # of cosines of single precision
-    assert np.abs(mitsuba[0][1][0] / expected - 1)[edge_on].max() > 0.1, "no power"
+    assert error[np.abs(cos_θ) > GRAZING].max() < 1e-3
+    assert power[edge_on].max() > 0.1
 
 
 @pytest.mark.parametrize("distance", [10 * RADIUS, 0], ids=["outside", "inside"])
