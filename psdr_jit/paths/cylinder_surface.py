@@ -1,9 +1,9 @@
 """The surface of cylinders, attached. Mitsuba finds it by the quadratic of the ray, in single precision.
 
 Near an outline the discriminant of that is the small difference of large numbers: seen from a hundred radii away, its
-derivative is wrong by half at cosines below .03, and by 5 per cent at .05; on the outline it is none at all. Here the
-attached ray meets the tangent plane of the material point (`own_surface`), and Mitsuba is asked for what it knows of
-that place with a ray along the normal, whose quadratic is well behaved, whatever the pose of the cylinder.
+derivative is wrong by half at cosines below .03, and by 2 per cent (rms) from .1 to .3; now and then it is none at all.
+Here the attached ray meets the tangent plane of the material point (`own_surface`), and Mitsuba is asked for what it
+knows of that place with a ray along the normal, whose quadratic is well behaved, whatever the pose of the cylinder.
 """
 
 from __future__ import annotations
