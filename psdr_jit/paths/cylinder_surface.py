@@ -4,6 +4,7 @@ Near an outline the discriminant of that is the small difference of large number
 derivative is wrong by half at cosines below .03, and by 2 per cent (rms) from .1 to .3; now and then it is none at all.
 Here the attached ray meets the tangent plane of the material point (`own_surface`), and Mitsuba is asked for what it
 knows of that place with a ray along the normal, whose quadratic is well behaved, whatever the pose of the cylinder.
+Points that follow the surface are Mitsuba's own: it asks no quadratic for them.
 """
 
 from __future__ import annotations
@@ -26,19 +27,17 @@ def cylinder_surface(
     follow: bool,
     active: mi.Bool,
 ) -> mi.SurfaceInteraction3f:
-    """The surface of a cylinder met by an attached ray; lanes that are not `active` hold anything. `follow`: the point
-    moves with the surface, not along the ray.
+    """The surface of a cylinder met by an attached ray; lanes that are not `active` hold anything. Called as its
+    neighbours are; `surface_at` does not with `follow`.
     """
     o, d, t = line = where_active(ray, pi, active)
     held = mi.Ray3f(dr.detach(o), dr.detach(d), 0, ray.wavelengths)
-    si = pi.compute_surface_interaction(held, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
-    if not follow:
-        n, x = dr.detach(si.n), held(t)
-        off = dr.detach(dr.norm(si.dp_du)) * (OFF / dr.two_pi)
-        p = dr.replace_grad(x, on_ray(o, d, t, n, si.p))
-        towards = mi.Ray3f(mi.Point3f(p + off * n), -n, 0, ray.wavelengths)
-        beneath = mi.PreliminaryIntersection3f(pi)
-        beneath.t = off
-        si = beneath.compute_surface_interaction(towards, mi.RayFlags.All, active)
-        si.p = mi.Point3f(p)
+    material = pi.compute_surface_interaction(held, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+    n, off = dr.detach(material.n), dr.detach(dr.norm(material.dp_du)) * (OFF / dr.two_pi)
+    p = dr.replace_grad(held(t), on_ray(o, d, t, n, material.p))
+    towards = mi.Ray3f(mi.Point3f(p + off * n), -n, 0, ray.wavelengths)
+    beneath = mi.PreliminaryIntersection3f(pi)
+    beneath.t = off
+    si = beneath.compute_surface_interaction(towards, mi.RayFlags.All, active)
+    si.p = mi.Point3f(p)
     return of_hit(si, pi, ray, line)

@@ -37,14 +37,14 @@ def surface_at(
         return pi.compute_surface_interaction(ray, flags, active)
     families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
     families += [(grid, grid_surface) for grid in tubes.grids]
-    if tubes.cylinders is not None and (dr.grad_enabled(ray) or tubes.cylinders.attached()):
+    follow = int(flags) & int(mi.RayFlags.FollowShape) != 0
+    if tubes.cylinders is not None and not follow and (dr.grad_enabled(ray) or tubes.cylinders.attached()):
         families.append((tubes.cylinders, cylinder_surface))
     met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
     elsewhere = mi.Bool(active)  # a copy: the caller's mask is not ours to change
     for *_, on_curve in met:
         elsewhere &= ~on_curve
     si = pi.compute_surface_interaction(ray, flags, elsewhere)
-    follow = int(flags) & int(mi.RayFlags.FollowShape) != 0
     for curves, of, segment, on_curve in met:
         own = of(curves, pi, segment, ray, follow, on_curve)
         # field by field: a whole interaction would be selected with its instance and its differentials
