@@ -90,7 +90,7 @@ PROBLEMS = (
     Problem("camera_thinlens", "camera.to_world", 0.004, direction=X, slow=True),
     Problem("camera_thinlens", "camera.focus_distance", 0.05, slow=True),
     Problem("camera_thinlens", "camera.aperture_radius", 0.01, slow=True),
-    Problem("camera_crop", "camera.to_world", 0.001, rotate=Y, slow=True),
+    Problem("camera_crop", "camera.to_world", 0.0003, rotate=Y, slow=True),
     Problem(
         "camera_crop", "camera.principal_point_offset_x", 0.0005,
         load={"rfilter": "gaussian", "sample_border": "true"}, tag="gaussian-border", slow=True,
@@ -108,7 +108,7 @@ PROBLEMS = (
     Problem("hidden_emitter", "card.vertex_positions", 0.005, direction=X, load=RGBA, options=HIDDEN, slow=True),
     # edges in contact
     Problem("concave_corner", "camera.to_world", 0.002, direction=X, slow=True),
-    Problem("stacked_cubes", "camera.to_world", 0.002, direction=Y, slow=True),
+    Problem("stacked_cubes", "camera.to_world", 0.0006, direction=Y, slow=True),
     Problem("three_sheets", "camera.to_world", 0.002, direction=X),
     Problem("inside_out", "boxes.vertex_positions", 0.004, rotate=Z, slow=True),
     # shadows, and what surfaces see of each other

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from helpers import adjoint_identity, assert_grad_close, fd, forward, load, motion_of, spec_of
@@ -9,16 +11,27 @@ from problems import PROBLEMS, Problem
 from test_adjoint import CASES, SIZE, TOLERANCE
 
 from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.statistics import gain
+from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.options import FORMS
 
 QUICK = ("sunk_box",)  # light that is scattered twice, and curves of contact
 ADJOINT = ("sky", "shadow", "sunk-mesh", "sunk-ball", "floor-around-ball", "camera-pose", "area-light-pose", "radiance")
 
 
+CONTACT, SAID_OFF = "in the material form, which this integrator was asked for", 0.1  # its warning at contacts
+
+
 def compare(p: Problem, seeds: int, spp: int, max_stderr: float, **size) -> None:
     scene = load(p, **size)
     motion = motion_of(p, scene)
-    spatial, material = (forward(motion, spec_of(scene, form=f, **p.options), seeds, spp) for f in FORMS)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", UnsupportedWarning)
+        spatial, material = (forward(motion, spec_of(scene, form=f, **p.options), seeds, spp) for f in FORMS)
+    if any(CONTACT in str(w.message) for w in said):
+        off = gain(material, spatial[0::2], spatial[1::2]).value - 1
+        assert abs(off) < SAID_OFF, off
+        return
     if np.allclose(spatial, material, rtol=1e-4, atol=1e-5 * np.abs(spatial).max()):
         return  # one vertex between light and sensor: the forms are the same
     assert_grad_close(material, spatial, max_stderr)

@@ -47,8 +47,8 @@ def card(bsdf: dict | None = None) -> dict:
 
 
 def wall() -> dict:
-    """Behind the floor: it sees what is lit there."""
-    place = mi.ScalarTransform4f().translate([0, 1.3, 1]).rotate([1, 0, 0], 90).scale(2)
+    """Behind the floor, above it: it sees what is lit there, and touches nothing."""
+    place = mi.ScalarTransform4f().translate([0, 1.3, 2.1]).rotate([1, 0, 0], 90).scale(2)
     return {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": 0.8}}
 
 

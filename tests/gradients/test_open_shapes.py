@@ -16,7 +16,10 @@ from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import block_means, block_test, gain
 
 SEEDS = 16
-STEP, TURN, PAN = 0.004, 0.004, 0.001  # of finite differences [scene units, rad]: 0.03 px at most
+# A camera at a distance sees corners and rims of a pixel's width: with three times this step, finite differences
+# themselves are off by 1.5 % (by 0.7 % with this one, by nothing with a third of it).
+STEP, TURN, PAN = 0.004, 0.004, 0.0003  # of finite differences [scene units, rad]: 0.03 px at most
+FEW, MANY = 4, 24  # samples of finite differences for each one of ours: the smaller the step, the more
 BLOCK = 4  # [px]
 MAX_Z = 5.0  # standard errors of a block
 FLOOR = 0.01  # of the brightest block: what finite differences of a few pixels' step are off themselves
@@ -116,7 +119,8 @@ def assert_agrees(name: str, kind: str, depth: int, param: str, step: float, spp
         param = "shape.to_world" if "shape.to_world" in mi.traverse(scene) else "shape.vertex_positions"
     motion = perturb(scene, param, **how)
     spec = {"type": "psdr_path", "max_depth": depth, "rr_depth": 1000}
-    estimate, reference = forward(motion, spec, SEEDS, spp), fd(motion, spec, step, SEEDS, 4 * spp)
+    estimate = forward(motion, spec, SEEDS, spp)
+    reference = fd(motion, spec, step, SEEDS, (MANY if step == PAN else FEW) * spp)
     slope = gain(estimate, reference[0::2], reference[1::2])
     assert slope.stderr < 0.02, slope
     assert abs(slope.value - 1) < max(TOLERANCE, 3 * slope.stderr), slope
@@ -125,6 +129,8 @@ def assert_agrees(name: str, kind: str, depth: int, param: str, step: float, spp
 
 
 LIGHTS = [("point", 2), ("area", 2), ("area", 4), ("sky", 2), ("sky", 3)]
+# no sky is seen from within a closed ball
+CASES = [(name, kind, depth) for name in SHAPES for kind, depth in LIGHTS if (name, kind) != ("ball", "sky")]
 
 
 @pytest.mark.slow
@@ -138,15 +144,13 @@ def test_a_tube_that_moves(llvm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind, depth", LIGHTS)
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name, kind, depth", CASES)
 def test_a_camera_that_turns(llvm, name, kind, depth):
     assert_agrees(name, kind, depth, "camera.to_world", PAN, 4096, rotate=(0, 0.2, 1))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind, depth", LIGHTS)
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name, kind, depth", CASES)
 def test_a_shape_that_moves(llvm, name, kind, depth):
     assert_agrees(name, kind, depth, "shape", STEP, 4096, direction=(1, 0, 0.3))
 
