@@ -17,6 +17,7 @@ from ..core.sdf_cell import Cell, across_face
 from ..core.sensor_frame import SensorFrame, viewpoint
 from ..core.surface_code import set_surface
 from .film_cover import LENS_CENTRE, outline_cover
+from .geometry import UNIT_ROUNDOFF
 from .grid_motion import crease_motion, surface_motion
 from .grid_rows import BORDER, CREASE, OUTLINE
 from .grid_set import Frame, GridRows, GridSet, cells_of
@@ -29,6 +30,12 @@ ASIDE = 2e-3
 
 #: How far off an edge the surface itself is looked at, in units of a cell.
 OFF = 1e-2
+
+#: The same off a step: another may be near, as where the surface passes close by an edge between four cells.
+OFF_STEP = 2e-4
+
+#: ... but clear of how exactly a point is known, relative to its coordinates.
+OFF_ROUNDING = 16 * UNIT_ROUNDOFF
 
 #: How far off an outline blended normals may still turn away, in units of a cell: what is tried in turn.
 AWAY = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5)
@@ -193,7 +200,10 @@ class GridEdges(ContourKind):
         off = dr.cross(at.dp, gradient)  # within the surface, across the face
         off = off * dr.sign(off.z) * dr.select(above, 1.0, -1.0)
         off = dr.select(is_outline, at.q, off)
-        cell_p = cell_p + OFF * off / dr.maximum(dr.norm(off), dr.smallest(mi.Float))
+        rounding = OFF_ROUNDING * dr.max(dr.abs(sight.at.x)) / _size(at.frame)
+        is_step = (at.rows.part == CREASE) & ~turns
+        step = dr.select(is_step, dr.clip(rounding, OFF_STEP, OFF), OFF)
+        cell_p = cell_p + step * off / dr.maximum(dr.norm(off), dr.smallest(mi.Float))
         value = dr.select(is_outline | above, at.cell.value(cell_p), at.below.value(cell_p))
         cell_p = cell_p - value / dr.squared_norm(gradient) * gradient
         return at.frame.to_world(dr.select(is_outline | above, cell_p, cell_p - mi.Vector3f(0, 0, 1)))

@@ -28,6 +28,9 @@ def compare(p: Problem, seeds: int, spp: int, max_stderr: float, **size) -> None
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UnsupportedWarning)
         spatial, material = (forward(motion, spec_of(scene, form=f, **p.options), seeds, spp) for f in FORMS)
+    for w in said:
+        if CONTACT not in str(w.message):
+            warnings.warn_explicit(w.message, w.category, w.filename, w.lineno)
     if any(CONTACT in str(w.message) for w in said):
         off = gain(material, spatial[0::2], spatial[1::2]).value - 1
         assert abs(off) < SAID_OFF, off
