@@ -5,11 +5,7 @@ keeps for it (`chain_fixed`). Which lobe is a matter of random numbers that the 
 (`chain_lobes`): paths part where the choice changes, too, though what is seen does not step there. A path's throughput
 is the product of the lobes' values over their probabilities.
 
-Two hits are on the same surface if a continuous path on it leads from the one to the other: the same plane where
-shapes are flat, the same shape met from the same side, in front of its face and of its shading normal, elsewhere,
-unless one point lies far off the other's tangent plane for their distance (a surface in front of itself) or their
-normals differ (a crease), which spheres and cylinders know nothing of. Such a guess may be wrong for rays that are far
-apart, which costs time, and is right for those close by, which is what counts. On the way, lamps are looked out for
+Whether two hits are on the same surface is a guess (`chain_surface`). On the way, lamps are looked out for
 that may hide between the two (`chain_lamps`).
 """
 
@@ -31,19 +27,10 @@ from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps
 from .chain_lobes import has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
+from .chain_surface import ChainSurfaces
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
 CHAIN_DEPTH = 8
-
-#: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
-COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
-
-#: Plugins of shapes that bulge everywhere: they cannot hide a part of themselves.
-ROUND = ("sphere", "cylinder")
-
-#: Curved surfaces: offset of one point from the tangent plane of the other, relative to their distance, and difference
-#: of the normals from which on they count as apart.
-STEP_SLOPE, STEP_NORMAL = 0.25, 0.3
 
 
 @dataclass(frozen=True)
@@ -52,10 +39,9 @@ class ChainWorld:
 
     scene: mi.Scene
     depth: int  # largest number of segments
-    flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
-    round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
+    surfaces: ChainSurfaces
     patterns: ChainPatterns | None  # None: no surface steps inside
-    moving: mi.UInt32  # by registry index: 1 if steps may move because of this shape
+    moving: mi.UInt32  # by registry index of a shape: 1 if steps may move because of this shape
     camera: mi.Bool  # may they because the camera does, ...
     lights: mi.Bool  # ... or because lights do?
     connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
@@ -68,15 +54,13 @@ class ChainWorld:
     @staticmethod
     def of(job: Job) -> ChainWorld:
         facts = job.facts
-        flat = {s.index for s in facts.shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         changing = {s.index for s in facts.shapes if s.geometry or s.shading or s.material}
         lights = facts.emitters_move or any(s.is_emitter and s.index in changing for s in facts.shapes)
         depth = min(job.limits.max_depth, CHAIN_DEPTH)
         return ChainWorld(
             scene=job.scene,
             depth=depth,
-            flat=registry_table(job.scene, flat),
-            round=registry_table(job.scene, {s.index for s in facts.shapes if s.plugin in ROUND}),
+            surfaces=ChainSurfaces.of(job),
             patterns=ChainPatterns.of(job),
             moving=registry_table(job.scene, changing),
             camera=varying(mi.Bool, facts.camera_moves),
@@ -159,25 +143,6 @@ class ChainRecords:
         return dr.gather(mi.Bool, self.bends, k * self.stride + self.lane, active)
 
 
-def same_surface(world: ChainWorld, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
-    """Do two rays of directions d end on one continuous surface, or both escape? `a`, `b`: surface interactions."""
-    both = a.is_valid() & b.is_valid()
-    same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
-    index = dr.select(both & same, dr.reinterpret_array(mi.UInt32, a.shape), 0)
-    flat = dr.gather(mi.UInt32, world.flat, index) != 0
-    offset = b.p - a.p
-    side = dr.dot(a.n, d_a) * dr.dot(b.n, d_b) > 0
-    near = COPLANAR_OFFSET * (a.t + b.t)
-    one_plane = (dr.norm(dr.cross(a.n, b.n)) < COPLANAR_SINE) & (dr.dot(a.n, b.n) > 0)
-    one_plane &= dr.abs(dr.dot(a.n, offset)) < near
-    n_a, n_b = a.sh_frame.n, b.sh_frame.n
-    off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
-    shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
-    close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
-    one_curve = side & shaded & (close | (dr.gather(mi.UInt32, world.round, index) != 0))
-    return same & (~both | dr.select(flat, one_plane & side, one_curve))
-
-
 @dataclass
 class Numbers:
     """Random numbers of one vertex, the same for all chains of a line."""
@@ -231,7 +196,7 @@ def trace_pair(
         pair.a, pair.b = Hit.of(ray_a, pi_a), Hit.of(ray_b, pi_b)
         if dr.hint(store is not None, mode="scalar"):
             store.write(pair.k, pair.a, active)
-        pair.differs = ~same_surface(world, a, b, ray_a.d, ray_b.d)
+        pair.differs = ~world.surfaces.same(a, b, ray_a.d, ray_b.d)
         if dr.hint(world.patterns is not None, mode="scalar"):
             crossed, family, where = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
             pair.differs |= crossed

@@ -1,0 +1,60 @@
+"""Are two hits on the same surface? Yes if a continuous path on it leads from the one to the other.
+
+The same plane where shapes are flat; elsewhere the same shape met from the same side, in front of its face and of its
+shading normal, unless one point lies far off the other's tangent plane for their distance (a surface in front of
+itself) or their normals differ (a crease), which spheres and cylinders know nothing of. Such a guess may be wrong for
+rays that are far apart, which costs time, and is right for those close by, which is what counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..plan.job import Job
+from ..scene.registry import registry_table
+
+#: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
+COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
+
+#: Plugins of shapes that bulge everywhere: they cannot hide a part of themselves.
+ROUND = ("sphere", "cylinder")
+
+#: Curved surfaces: offset of one point from the tangent plane of the other, relative to their distance, and difference
+#: of the normals from which on they count as apart.
+STEP_SLOPE, STEP_NORMAL = 0.25, 0.3
+
+
+@dataclass(frozen=True)
+class ChainSurfaces:
+    """What is to be known of a scene's shapes. Host object."""
+
+    flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
+    round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
+
+    @staticmethod
+    def of(job: Job) -> ChainSurfaces:
+        shapes = job.facts.shapes
+        flat = {s.index for s in shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
+        bulging = {s.index for s in shapes if s.plugin in ROUND}
+        return ChainSurfaces(registry_table(job.scene, flat), registry_table(job.scene, bulging))
+
+    def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
+        """Do two rays of directions d end on one surface, or both escape? `a`, `b`: surface interactions."""
+        both = a.is_valid() & b.is_valid()
+        same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
+        index = dr.select(both & same, dr.reinterpret_array(mi.UInt32, a.shape), 0)
+        flat = dr.gather(mi.UInt32, self.flat, index) != 0
+        offset = b.p - a.p
+        side = dr.dot(a.n, d_a) * dr.dot(b.n, d_b) > 0
+        near = COPLANAR_OFFSET * (a.t + b.t)
+        one_plane = (dr.norm(dr.cross(a.n, b.n)) < COPLANAR_SINE) & (dr.dot(a.n, b.n) > 0)
+        one_plane &= dr.abs(dr.dot(a.n, offset)) < near
+        n_a, n_b = a.sh_frame.n, b.sh_frame.n
+        off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
+        shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
+        close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
+        one_curve = side & shaded & (close | (dr.gather(mi.UInt32, self.round, index) != 0))
+        return same & (~both | dr.select(flat, one_plane & side, one_curve))
