@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.ad import accumulate
 from ..core.records import Hit
 from ..core.varying import varying
 from ..paths.delta_step import delta_step
@@ -88,7 +89,7 @@ def through_vertex(
         reached.sh_frame = mi.Frame3f(mi.Normal3f(n))
         reached.wi = reached.to_local(-ω)
         step = delta_step(mi.BSDFContext(), reached, bsdf, ω_out, delta)
-        dr.backward_from(dr.select(delta, dr.dot(b, step.d), 0))
+        accumulate(dr.select(delta, dr.dot(b, step.d), 0))  # what is behind a mask alone is seen straight through it
         b_in, b_n = mi.Vector3f(dr.grad(ω)), mi.Vector3f(dr.grad(n))
     with dr.resume_grad():
         û = mi.Vector3f(0, 0, 0) + dr.zeros(mi.Vector3f, dr.width(b))
@@ -98,6 +99,6 @@ def through_vertex(
         near.t = lead(si.p)
         ray = mi.Ray3f(si.p - near.t * ω_in + û, ω_in)
         there = near.compute_surface_interaction(ray, mi.RayFlags.All, delta)
-        dr.backward_from(dr.select(delta, dr.dot(b_n, there.sh_frame.n), 0))
+        accumulate(dr.select(delta, dr.dot(b_n, there.sh_frame.n), 0))  # flat faces do not bend
         bent = mi.Vector3f(dr.grad(û))
     return dr.select(delta, b_in, 0), dr.select(delta, bent, 0)
