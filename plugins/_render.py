@@ -12,6 +12,7 @@ from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
 from psdr_jit.driver.aovs import AovChannels, require_no_derivative
 from psdr_jit.driver.prepare import Prepared, prepare
+from psdr_jit.driver.primal import image_plugin
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import ParameterError, PsdrError
 from psdr_jit.options import Options
@@ -23,7 +24,9 @@ from psdr_jit.scene.io import find_sensor
 
 
 class TermIntegrator(ADIntegrator):
-    """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's `path`, unless it says more."""
+    """An integrator whose derivative is a sum of terms; its primal image is Mitsuba's (`image_plugin`), unless it says
+    more.
+    """
 
     bidirectional = False  # can it trace light subpaths?
 
@@ -37,14 +40,12 @@ class TermIntegrator(ADIntegrator):
         self.aovs = AovChannels(self.options)
         self.counters = Counters()
         self.stats = {"rejected": self.counters.rejected, "grazing": self.counters.grazing}  # dropped, or cut short
-        self._path = mi.load_dict(
-            {
-                "type": "path",
-                "max_depth": self.options.max_depth,
-                "rr_depth": self.options.rr_depth,
-                "hide_emitters": self.options.hide_emitters,
-            }
-        )
+        path_options = {
+            "max_depth": self.options.max_depth,
+            "rr_depth": self.options.rr_depth,
+            "hide_emitters": self.options.hide_emitters,
+        }
+        self._images = {name: mi.load_dict({"type": name, **path_options}) for name in ("path", "prb")}
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         require_integrator(self)
@@ -54,13 +55,16 @@ class TermIntegrator(ADIntegrator):
             return self.aovs.beside(self.primal(scene, view, seed, spp, develop, evaluate), scene, view, seed, spp)
         self.aovs.require_one_view()
         if not is_uniform(view):
-            return self._path.render(scene, view, seed, spp, develop, evaluate)
+            return self._image_of(scene).render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
         return side_by_side([self.primal(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
 
     def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
         """The image itself, by one sensor."""
-        return self._path.render(scene, sensor, seed, spp, develop, evaluate)
+        return self._image_of(scene).render(scene, sensor, seed, spp, develop, evaluate)
+
+    def _image_of(self, scene):
+        return self._images[image_plugin(scene, self.options.hide_emitters)]
 
     def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
         """A render call of this integrator as data; `film`: in place of the sensor's own."""
@@ -115,7 +119,8 @@ class TermIntegrator(ADIntegrator):
         """Radiance of one ray, for integrators around this one, such as Mitsuba's `aov`; not for derivatives."""
         require_no_derivative(scene, ray)
         active = kwargs.get("active", True)
-        value, valid, _ = self._path.sample(scene, sampler, mi.RayDifferential3f(dr.detach(ray)), None, active)
+        ray = mi.RayDifferential3f(dr.detach(ray))
+        value, valid, _ = self._images["path"].sample(scene, sampler, ray, None, active)
         return value, valid, [], None
 
     def to_string(self):

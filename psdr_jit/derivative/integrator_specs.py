@@ -16,6 +16,7 @@ import numpy as np
 
 from psdr_jit.core.film import black
 from psdr_jit.driver.aovs import AovChannels
+from psdr_jit.driver.primal import image_plugin
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
 from psdr_jit.options import FOLLOWS
@@ -117,7 +118,7 @@ def build_term(spec: Mapping[str, Any], term: str) -> Any:
 
 
 def reference(spec: Mapping[str, Any], scene: Any) -> Any:
-    """What finite differences are taken of: Mitsuba's `path` with the path options of `spec`.
+    """What finite differences are taken of: Mitsuba's `path`, or what `image_plugin` says, with the options of `spec`.
 
     Where `psdr_bdpt` shows what `path` does not, light of points by way of mirrors and smooth glass: `psdr_bdpt`.
     With `aovs`, Mitsuba's `aov` around it.
@@ -130,7 +131,7 @@ def reference(spec: Mapping[str, Any], scene: Any) -> Any:
         facts = analyse(scene)
         if facts.has_delta_emitters and facts.has_delta_lobes:
             return build({"type": "psdr_bdpt", **options})
-    return build({"type": "path", **options})
+    return build({"type": image_plugin(scene, bool(options.get("hide_emitters", False))), **options})
 
 
 def rejected(integrator: Any) -> int | None:

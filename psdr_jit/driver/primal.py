@@ -1,7 +1,8 @@
-"""The image itself where light subpaths help: camera paths with their share of the weights, and what light brings.
+"""The image itself: which plugin of Mitsuba renders it; and where light subpaths help, camera paths with their share of
+the weights, and what light brings.
 
-Equal in expectation to Mitsuba's `path`, but for light of points by way of mirrors and smooth glass, which camera paths
-cannot find.
+That is equal in expectation to Mitsuba's `path`, but for light of points by way of mirrors and smooth glass, which
+camera paths cannot find.
 """
 
 from __future__ import annotations
@@ -27,6 +28,18 @@ from ..plan.light_plan import plan_light
 from ..plan.motion import SceneMotion
 from ..plan.plan import Plan
 from ..scene.facts import analyse
+
+
+def image_plugin(scene: mi.Scene, hide_emitters: bool) -> str:
+    """The plugin of Mitsuba that renders the image of `scene` in full: `path`, or `prb`.
+
+    Of a path that leaves the scene, `path` drops all light if the lobes that it followed were null ones and no sky is
+    there to be seen: what masks reflect is darker by their opacity [Mitsuba 3.9.1, `src/integrators/path.cpp`,
+    `valid_ray`].
+    """
+    sky_is_seen = scene.environment() is not None and not hide_emitters
+    passes = any(shape.bsdf().flags() & int(mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf() is not None)
+    return "prb" if passes and not sky_is_seen else "path"
 
 
 def bidirectional_image(call: Call) -> mi.TensorXf | None:
