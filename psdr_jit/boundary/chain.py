@@ -44,13 +44,14 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_chain
-from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
+from .chain_crossing import adjoint_of_speed, crossings, gradient_of, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
 from .chain_outline import Curve, beside_line
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
+from .mirror_rims import has_rims, is_counted
 
 NAME = "chain"
 
@@ -98,8 +99,7 @@ class End:
         r = dr.select(near, self.distance, 1)
         aimed = line.d + dr.select(near, (moved - (o - dr.detach(o))) / r, turned)
         d = dr.select(self.in_light, dr.normalize(aimed), d)
-        on_surface = any(s.smooth or s.patterns for s in facts.shapes)
-        return self.curve.attached_F(o, d, moving, on_surface)
+        return self.curve.attached_F(o, d, moving, facts)
 
 
 def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
@@ -148,10 +148,13 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     if lines.world.patterns is not None:
         pair = beside_line(job.scene, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
-    end = End(pair.last, curve, pair.in_light, pair.light, source, distance)
+    end = End(pair.sight, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
-    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
+    gradient = gradient_of(lines, chain, end, p, lambda q: _first(lines, chain, line, q))
+    valid, step = step_per_slope(curve, line, gradient)
+    if has_rims(job.facts):
+        valid &= is_counted(lines, pair, line, curve.line)
     per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)

@@ -28,20 +28,23 @@ def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
     chain = ChainRecords(dr.width(found.k), lines.world.depth)
     pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
     dr.eval(pair, chain.hits, chain.bends)
-    curve = crossed_curve(lines.analytic, lines.world.patterns, pair)
+    sight = dr.select(pair.horizon, chain.segment(pair.sight, pair.horizon), pair.a)
+    curve = crossed_curve(lines.analytic, lines.world.patterns, pair, sight)
     dr.eval(curve)
     return chain, pair, curve
 
 
-def step_per_slope(lines: SearchedLines, chain: ChainRecords, end, at: tuple, first: Callable):
-    """`(valid, −F_X / |∇F|²)` at `at`: (place, line); `first` gives the attached starts and directions of the first
-    segments at a place. Detached."""
-    p, line = at
-    F_x, F_y = (_slope(lines, chain, end, p, axis, first) for axis in (0, 1))
-    slope2 = dr.square(F_x) + dr.square(F_y)
-    valid = end.curve.valid & (dr.square(end.curve.F) < dr.square(MOST_OFF) * slope2)
-    along = dr.select(line.horizontal, F_x, F_y)
-    return valid, -along / slope2
+def gradient_of(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, first: Callable) -> mi.Vector2f:
+    """(F_x, F_y) at the places `p`; `first` gives the attached starts and directions of the first segments at a place.
+    Detached."""
+    return mi.Vector2f(*(_slope(lines, chain, end, p, axis, first) for axis in (0, 1)))
+
+
+def step_per_slope(curve: Curve, line, gradient: mi.Vector2f) -> tuple[mi.Bool, mi.Float]:
+    """`(valid, −F_X / |∇F|²)` of crossings of the lines `line`."""
+    slope2 = dr.squared_norm(gradient)
+    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
+    return valid, -dr.select(line.horizontal, gradient.x, gradient.y) / slope2
 
 
 def _slope(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, axis: int, first: Callable) -> mi.Float:

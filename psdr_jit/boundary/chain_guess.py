@@ -19,10 +19,8 @@ import mitsuba as mi
 from ..core.records import Hit
 from .chain_outline import SIDES, AnalyticShapes, triangle
 from .chain_patterns import NO_FAMILY
+from .chain_surface import NOWHERE
 from .chain_trace import Pair
-
-#: No guess.
-NOWHERE = -1.0
 
 
 def _zero(f: mi.Float, g: mi.Float) -> mi.Float:
@@ -75,7 +73,7 @@ class Guesses:
     def where(self, pair: Pair, active: mi.Bool) -> mi.Float:
         """Share of the way from a to b, or `NOWHERE`. Detached."""
         active = active & ~pair.chosen
-        outlined = active & (pair.family == NO_FAMILY)
+        outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon
         first = pair.a.intersection().t <= pair.b.intersection().t
         near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
         of_near, of_far = (triangle(hit, outlined) for hit in (near, far))

@@ -8,7 +8,8 @@ with m_i one or two material points and t the distance. On an edge, m is a point
 a sphere or cylinder, m is the point of contact and c the normal there: an outline moves with the normal velocity of the
 surface, and a turn of the line of sight about m moves it along the tangent plane. Where two surfaces cut, with normals
 n_i, the curve moves by both: c_1 = (n_2·d) n_1, c_2 = −(n_1·d) n_2. And where an interpolated normal n turns away from
-the line of sight, F = n·d itself, at the point that the line meets.
+the line of sight, F = n·d itself, at the point that the line meets. With the direction ω in which a delta lobe there is
+left, and the face's own normal n, F = n·ω where paths begin to go on under the face (`chain_surface`).
 
 The nearer surface is the one that ends. If both are equally near, they touch along an edge of the one or of the other
 (a crease), or cut into each other: the curve that the line of sight passes closest by is taken. A shape that goes on,
@@ -25,8 +26,10 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
 from ..edges.points import LEAST_SLANT, clear_of_lift
+from ..paths.delta_step import delta_step
 from ..plan.job import Job
 from ..plan.motion import Displacements
+from ..scene.facts import SceneFacts
 from ..scene.registry import registry_values
 from .chain_patterns import INSET, NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
@@ -59,6 +62,8 @@ class Curve:
 
     line: Hit  # the line of sight, and what it meets
     shading: mi.Bool  # F = n·d
+    horizon: mi.Bool  # F = n·ω
+    onward: mi.Vector3f  # the direction ω
     pattern: mi.Bool  # F = g·(u, v), up to a constant
     g: mi.Vector2f
     cut: mi.Bool  # it is the curve along which two surfaces cut
@@ -71,18 +76,19 @@ class Curve:
     F: mi.Float  # where the chain was traced [m]
     valid: mi.Bool
 
-    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, on_surface: bool) -> mi.Float:
-        """F of the attached line of sight (o, d) and of what moves.
-
-        `on_surface`: there may be shading outlines and patterns.
-        """
+    def attached_F(self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, facts: SceneFacts) -> mi.Float:
+        """F of the attached line of sight (o, d) and of what moves."""
         F = dr.dot(self.c1 + self.c2, o + self.t * d)
         F -= dr.dot(self.c1, moving.of_surface(self.m1)) + dr.dot(self.c2, moving.of_surface(self.m2))
-        if not on_surface:
+        smooth = any(s.smooth for s in facts.shapes)
+        if not (smooth or any(s.patterns for s in facts.shapes)):
             return F
         si = moving.surface(self.line, mi.Ray3f(o, d), mi.RayFlags.All)
         n = dr.select(self.shading, mi.Vector3f(si.sh_frame.n), 0)
         F = dr.select(self.shading, dr.dot(n, d), F)
+        if smooth:
+            ω = delta_step(mi.BSDFContext(), si, si.bsdf(), self.onward, self.horizon).d
+            F = dr.select(self.horizon, dr.dot(si.n, ω), F)
         return dr.select(self.pattern, dr.dot(self.g, si.uv), F)
 
 
@@ -203,11 +209,12 @@ def _interaction(hit: Hit) -> mi.SurfaceInteraction3f:
     return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.All)
 
 
-def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None, pair: Pair) -> Curve:
-    """The curve between the ends of the two chains, for the line of sight of the first."""
-    line = mi.Ray3f(pair.a.o, pair.a.d)
+def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None, pair: Pair, sight: Hit) -> Curve:
+    """The curve between the two chains, for the line of sight of the first: its segment `sight`."""
+    line = mi.Ray3f(sight.o, sight.d)
     first = pair.a.intersection().t <= pair.b.intersection().t
     near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
+    near, far = (dr.select(pair.horizon, sight, hit) for hit in (near, far))
     si_near, si_far = _interaction(near), _interaction(far)
     best = _outline(shapes, near, si_near.p, line)
     touching = (far.shape != 0) & (far.t - near.t < TOUCHING * far.t)
@@ -232,9 +239,13 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
         pattern = pair.family != NO_FAMILY
         g, F_line, side_line = patterns.line(pair.family, _interaction(pair.a), _interaction(pair.b))
         F, shading, side = dr.select(pattern, F_line, F), shading & ~pattern, dr.select(pattern, side_line, side)
+    horizon = pair.horizon & pair.one_face
+    F = dr.select(horizon, dr.dot(si_near.n, pair.a.d), F)
     return Curve(
-        line=pair.a,
+        line=sight,
         shading=shading,
+        horizon=horizon,
+        onward=pair.a.d,
         pattern=pattern,
         g=g,
         cut=cut & ~pattern & ~shading,

@@ -2,8 +2,12 @@
 
 The same plane where shapes are flat; elsewhere the same shape met from the same side, in front of its face and of its
 shading normal, unless one point lies far off the other's tangent plane for their distance (a surface in front of
-itself) or their normals differ (a crease), which spheres and cylinders know nothing of. Such a guess may be wrong for
-rays that are far apart, which costs time, and is right for those close by, which is what counts.
+itself) or their normals differ (a crease), which spheres, cylinders and single triangles know nothing of. Such a guess
+may be wrong for rays that are far apart, which costs time, and is right for those close by, which is what counts.
+
+Where normals are interpolated, a direction ω may lead away from the surface by the shading normal n_s, and under it by
+the face's normal n. Such a path goes on behind the surface that it is reflected by. Where that begins, at n·ω = 0 or on
+the edge to a face that is tilted otherwise, what is seen steps: a horizon of the face.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ ROUND = ("sphere", "cylinder")
 #: of the normals from which on they count as apart.
 STEP_SLOPE, STEP_NORMAL = 0.25, 0.3
 
+#: No guess of where chains part.
+NOWHERE = -1.0
+
 
 @dataclass(frozen=True)
 class ChainSurfaces:
@@ -33,13 +40,15 @@ class ChainSurfaces:
 
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
     round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
+    horizons: bool  # are there shading normals?
 
     @staticmethod
     def of(job: Job) -> ChainSurfaces:
         shapes = job.facts.shapes
         flat = {s.index for s in shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         bulging = {s.index for s in shapes if s.plugin in ROUND}
-        return ChainSurfaces(registry_table(job.scene, flat), registry_table(job.scene, bulging))
+        tables = (registry_table(job.scene, indices) for indices in (flat, bulging))
+        return ChainSurfaces(*tables, any(s.smooth for s in shapes))
 
     def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
         """Do two rays of directions d end on one surface, or both escape? `a`, `b`: surface interactions."""
@@ -56,5 +65,11 @@ class ChainSurfaces:
         off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
         shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
         close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
-        one_curve = side & shaded & (close | (dr.gather(mi.UInt32, self.round, index) != 0))
+        one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
+        one_curve = side & shaded & (one_face | close | (dr.gather(mi.UInt32, self.round, index) != 0))
         return same & (~both | dr.select(flat, one_plane & side, one_curve))
+
+
+def goes_under(si: mi.SurfaceInteraction3f, ω: mi.Vector3f) -> mi.Bool:
+    """Does the direction ω lead to one side by the face's normal, and to the other one by the shading normal?"""
+    return dr.dot(si.n, ω) * dr.dot(si.sh_frame.n, ω) < 0

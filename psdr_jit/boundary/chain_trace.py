@@ -5,14 +5,14 @@ keeps for it (`chain_fixed`). Which lobe is a matter of random numbers that the 
 (`chain_lobes`): paths part where the choice changes, too, though what is seen does not step there. A path's throughput
 is the product of the lobes' values over their probabilities.
 
-Whether two hits are on the same surface is a guess (`chain_surface`). On the way, lamps are looked out for
-that may hide between the two (`chain_lamps`).
+Whether two hits are on the same surface, and whether two paths leave it to the same side, is told by `chain_surface`.
+On the way, lamps are looked out for that may hide between the two (`chain_lamps`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -25,9 +25,9 @@ from ..scene.registry import registry_table
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps
-from .chain_lobes import has_delta, leave, smooth_choice
+from .chain_lobes import Leaving, has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
-from .chain_surface import ChainSurfaces
+from .chain_surface import NOWHERE, ChainSurfaces, goes_under
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
 CHAIN_DEPTH = 8
@@ -93,6 +93,8 @@ class Pair:
     emits: mi.Bool  # does what segment k ends at count with its emission?
     in_light: mi.Bool  # they part in what they see of `light` from the end of segment k, which they share
     seen: mi.Bool  # it is the first that sees it
+    horizon: mi.Bool  # they part as they leave what segment k − 1 ends at, ...
+    one_face: mi.Bool  # ... and that is one face, not the edge between two
     family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
     where: mi.Float  # between the chains that line lies: share of the way from a to b, roughly
     lamp: mi.Float  # where between them a lamp may hide, likewise, ...
@@ -106,17 +108,22 @@ class Pair:
     @staticmethod
     def start() -> Pair:
         """No two of its arrays may be one object: loops change them in place."""
-        differs, specular, chosen, moves, in_light, seen = (mi.Bool(False) for _ in range(6))
+        differs, specular, chosen, moves, in_light, seen, horizon, one_face = (mi.Bool(False) for _ in range(8))
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         a, b = (Hit.made(dr.zeros, 1) for _ in range(2))
         where, lamp, miss = mi.Float(0.5), mi.Float(0.5), mi.Float(dr.inf)
-        return Pair(mi.UInt32(0), differs, specular, chosen, moves, mi.Bool(True), in_light, seen, mi.UInt32(NO_FAMILY),
-                    where, lamp, miss, light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
+        return Pair(mi.UInt32(0), differs, specular, chosen, moves, mi.Bool(True), in_light, seen, horizon, one_face,
+                    mi.UInt32(NO_FAMILY), where, lamp, miss, light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
 
     @property
     def last(self) -> mi.UInt32:
         """Number of the segment whose ends part, shadow rays counted."""
         return self.k + dr.select(self.in_light, mi.UInt32(1), 0)
+
+    @property
+    def sight(self) -> mi.UInt32:
+        """Number of the segment that the crossed curve is met by: before a horizon it is the last but one."""
+        return self.last - dr.select(self.horizon, mi.UInt32(1), 0)
 
 
 class ChainRecords:
@@ -197,10 +204,12 @@ def trace_pair(
         if dr.hint(store is not None, mode="scalar"):
             store.write(pair.k, pair.a, active)
         pair.differs = ~world.surfaces.same(a, b, ray_a.d, ray_b.d)
+        pair.horizon &= pair.differs
         if dr.hint(world.patterns is not None, mode="scalar"):
+            guessed = active & ~pair.horizon
             crossed, family, where = world.patterns.crossed(a, b, active & ~pair.differs & a.is_valid())
             pair.differs |= crossed
-            pair.family, pair.where = dr.select(active, family, pair.family), dr.select(active, where, pair.where)
+            pair.family, pair.where = dr.select(active, family, pair.family), dr.select(guessed, where, pair.where)
         if dr.hint(world.lamps is not None, mode="scalar"):
             share, miss = world.lamps.between(line, (ray_a, a), (ray_b, b))
             nearer = active & pair.emits & (pair.k > 0) & (miss < pair.miss)
@@ -223,6 +232,8 @@ def trace_pair(
         if dr.hint(store is not None, mode="scalar"):
             store.write_bend(pair.k, on_a.by_delta, active)
         active = on_a.alive & on_b.alive & ~pair.chosen
+        if dr.hint(world.surfaces.horizons, mode="scalar"):
+            pair = leave_to(pair, (a, b), (on_a, on_b), active)
         pair.k += dr.select(active, mi.UInt32(1), 0)
         pair.emits = dr.select(active, on_a.by_delta, pair.emits)
         pair.β_a *= dr.select(active, on_a.factor, 1)
@@ -242,22 +253,28 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
     hit_a, seen_a = light.seen_from(world.scene, a, active)
     hit_b, seen_b = light.seen_from(world.scene, b, active)
     parts = active & (seen_a != seen_b)
-    return Pair(
-        k=pair.k,
+    return replace(
+        pair,
         differs=pair.differs | parts,
-        specular=pair.specular,
-        chosen=pair.chosen,
         moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))),
-        emits=pair.emits,
         in_light=parts,
         seen=seen_a,
-        family=pair.family,
-        where=pair.where,
-        lamp=pair.lamp,
-        miss=pair.miss,
         light=dr.select(parts, light, pair.light),
         a=dr.select(parts, hit_a, pair.a),
         b=dr.select(parts, hit_b, pair.b),
-        β_a=pair.β_a,
-        β_b=pair.β_b,
+    )
+
+
+def leave_to(pair: Pair, ends: tuple, onward: tuple[Leaving, Leaving], active: mi.Bool) -> Pair:
+    """Do the chains leave their surfaces, whose interactions are `ends`, to the same side of the faces?"""
+    (a, b), (ω_a, ω_b) = ends, (leaving.ray.d for leaving in onward)
+    one_face = (a.shape == b.shape) & (a.prim_index == b.prim_index)
+    horizon = active & (goes_under(a, ω_a) != goes_under(b, ω_b))
+    h_a, h_b = dr.dot(a.n, ω_a), dr.dot(b.n, ω_b)
+    where = dr.select(one_face & (h_a * h_b < 0), h_a / (h_a - h_b), NOWHERE)
+    return replace(
+        pair,
+        horizon=dr.select(active, horizon, pair.horizon),
+        one_face=dr.select(active, one_face, pair.one_face),
+        where=dr.select(horizon, where, pair.where),
     )

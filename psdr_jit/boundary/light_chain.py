@@ -45,7 +45,7 @@ from ..paths.light_walk import take_up
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
-from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
+from .chain_crossing import adjoint_of_speed, crossings, gradient_of, step_per_slope
 from .chain_fixed import Directions
 from .chain_outline import Curve, beside_cut, beside_line
 from .chain_search import find_crossings
@@ -86,8 +86,7 @@ class LightEnd:
             aimed += dr.select(near, shift / self.distance, turn)
         aimed -= (o - dr.detach(o)) / self.distance
         d = dr.select(self.to_sensor, dr.normalize(aimed), d)
-        on_surface = any(s.smooth or s.patterns for s in facts.shapes)
-        return self.curve.attached_F(o, d, moving, on_surface)
+        return self.curve.attached_F(o, d, moving, facts)
 
 
 @dataclass
@@ -162,7 +161,8 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 
-    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (line.origin(q), line.direction(q)))
+    gradient = gradient_of(lines, chain, end, p, lambda q: (line.origin(q), line.direction(q)))
+    valid, step = step_per_slope(curve, line, gradient)
     per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
     for i, hit in enumerate(ends):
@@ -185,7 +185,7 @@ def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> Ligh
     if frame.kind != "orthographic":
         lens = frame.to_world @ lens_point(frame, aperture)
         distance = dr.norm(lens - curve.line.o)
-    return LightEnd(pair.last, curve, pair.in_light, view.film, aperture, lens, distance)
+    return LightEnd(pair.sight, curve, pair.in_light, view.film, aperture, lens, distance)
 
 
 def _leave(moving: Displacements, side: Side) -> tuple[mi.Vector3f, mi.Vector3f]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,7 @@ class End:
     curve: Curve
 
     def attached_F(self, o, d, moving, facts):
-        return self.curve.attached_F(o, d, moving, False)
+        return self.curve.attached_F(o, d, moving, facts)
 
 
 def curve_on(scene: mi.Scene) -> Curve:
@@ -45,8 +46,8 @@ def curve_on(scene: mi.Scene) -> Curve:
     hit = dr.select(no, hit, hit)  # as wide as the others
     slope = mi.Vector3f(mi.Float(SLOPES), 0, 0)
     m = replace(hit, shape=dr.select(dr.arange(mi.UInt32, LANES) == 1, 0, hit.shape))  # of the second, on nothing
-    return Curve(hit, no, no, mi.Vector2f(0), no, nothing, m, m, slope, mi.Vector3f(0), nothing, slope.x,
-                 dr.isfinite(slope.x))  # fmt: skip
+    return Curve(hit, no, no, mi.Vector3f(0), no, mi.Vector2f(0), no, nothing, m, m, slope, mi.Vector3f(0), nothing,
+                 slope.x, dr.isfinite(slope.x))  # fmt: skip
 
 
 def adjoints(λ: tuple[float, ...], first: tuple | None = None):
@@ -64,7 +65,7 @@ def adjoints(λ: tuple[float, ...], first: tuple | None = None):
             records.write(mi.UInt32(0), replace(curve.line, d=mi.Vector3f(*map(mi.Float, first))), mi.Bool(True))
         end = End(dr.full(mi.UInt32, int(first is not None), LANES), curve)
         motion = SceneMotion(scene.sensors()[0])
-        found = adjoints_at_start(None, records, end, mi.Float(λ), motion, rejected)
+        found = adjoints_at_start(SimpleNamespace(shapes=()), records, end, mi.Float(λ), motion, rejected)
     return *(np.array(v) for v in found), np.array(dr.grad(leaf)), int(rejected)
 
 

@@ -1,0 +1,90 @@
+"""Smooth-shaded mirrors and glass near their outlines, where light is reflected under the faces of their meshes."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import pytest
+from helpers import adjoint_identity, assert_grad_close, fd, forward
+from test_smooth_meshes import sphere, torus
+
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import perturb
+
+SIZE, SEEDS = 24, 16
+STEP, SMALL_TURN = 4e-3, 8e-3
+SHIFT = (1.0, 0.3, 0.2)
+MIRROR = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.5}}
+BSDFS = {
+    "mirror": (MIRROR, 2),
+    "glass": ({"type": "dielectric", "int_ior": 1.5}, 3),
+    "plastic": ({"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": 0.2}}, 2),
+}
+MOTIONS = {
+    "move": ("ball.vertex_positions", {"direction": SHIFT}, STEP),
+    "turn": ("ball.vertex_positions", {"rotate": (0.3, 1, 0.2)}, SMALL_TURN),
+    "camera": ("camera.to_world", {"direction": SHIFT}, STEP),
+}
+
+
+def look_at(origin, target) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 0, 1])
+
+
+def scene_of(ball: mi.Mesh, **more: dict) -> mi.Scene:
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    pose = look_at([0.3, -4, 1], [0, 0, 0])
+    return mi.load_dict({
+        "type": "scene", "sky": {"type": "constant"}, "ball": ball,
+        "camera": {"type": "perspective", "fov": 40, "to_world": pose, "film": film}, **more,
+    }, optimize=False)  # fmt: skip
+
+
+def spec(depth: int, **budgets) -> dict:
+    return {"type": "psdr_path", "max_depth": depth, "rr_depth": 1000, **budgets}
+
+
+def check(ball: mi.Mesh, depth: int, motion: str, reference_spp: int) -> None:
+    param, how, step = MOTIONS[motion]
+    moved = perturb(scene_of(ball), param, **how)
+    reference = fd(moved, spec(depth), step, SEEDS, reference_spp)
+    assert_grad_close(forward(moved, spec(depth), SEEDS, 256), reference, max_stderr=0.05)
+
+
+def test_a_ball_that_mirrors_a_sky(llvm):
+    """All that can be seen to move are outlines and rims; inside of the ball it is dark."""
+    surface, depth = BSDFS["mirror"]
+    check(sphere(12, bsdf=surface), depth, "move", 1024)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("segments", [12, 32])
+@pytest.mark.parametrize("bsdf", BSDFS)
+def test_a_ball_under_a_sky(llvm, bsdf, segments, motion):
+    surface, depth = BSDFS[bsdf]
+    check(sphere(segments, bsdf=surface), depth, motion, 8192)
+
+
+@pytest.mark.slow
+def test_a_ring_that_mirrors_itself(llvm):
+    moved = perturb(scene_of(torus(16, bsdf=MIRROR)), "ball.vertex_positions", direction=SHIFT)
+    reference = fd(moved, spec(4), STEP, SEEDS, 8192)
+    assert_grad_close(forward(moved, spec(4), SEEDS, 512), reference, max_stderr=0.05)
+
+
+@pytest.mark.slow
+def test_a_ball_in_a_mirror(llvm):
+    """Rims that the camera sees by way of another mirror are found by the lines across the film alone."""
+    mirror = {"type": "rectangle", "bsdf": {"type": "conductor"},
+              "to_world": look_at([0, 2.5, 0], [0, -4, 0.5]).scale(4)}  # fmt: skip
+    moved = perturb(scene_of(sphere(12, bsdf=MIRROR), mirror=mirror), "ball.vertex_positions", direction=SHIFT)
+    reference = fd(moved, spec(3), STEP, SEEDS, 16384)
+    assert_grad_close(forward(moved, spec(3), SEEDS, 512), reference, max_stderr=0.05)
+
+
+@pytest.mark.parametrize("bsdf", ["mirror", pytest.param("glass", marks=pytest.mark.slow)])
+def test_forward_and_backward_agree(llvm, bsdf):
+    surface, depth = BSDFS[bsdf]
+    integrator = integrator_specs.build(spec(depth, sppc=0, sppp=16, sppi=0, spps=16))
+    wJv, JTwv, w, Jv = adjoint_identity(scene_of(sphere(12, bsdf=surface)), "ball.vertex_positions", integrator)
+    assert Jv > 1e-3 and abs(wJv - JTwv) <= 1e-6 * w * Jv
