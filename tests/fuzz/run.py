@@ -1,4 +1,7 @@
-"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT`."""
+"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [specular]`.
+
+`specular`: with mirrors, glass, plastic, windows and masks.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,17 @@ import sys
 
 import mitsuba as mi
 from fuzz.scenes import case_of
+from fuzz.specular import specular_case_of
 from fuzz.verdict import VARIANT, examine
 
 import psdr_jit  # noqa: F401  (registers the plugins)
 
+KINDS = {"": case_of, "specular": specular_case_of}
 
-def main(first: int, count: int) -> None:
+
+def main(first: int, count: int, kind: str = "") -> None:
     for seed in range(first, first + count):
-        case = case_of(seed)
+        case = KINDS[kind](seed)
         outcome = examine(case)
         spec = case["integrator"]
         print(f"{seed:5d} {outcome.seconds:6.1f} s  {outcome.word:22s} {case['param']} {case['how']} {spec['form']} "
@@ -23,4 +29,4 @@ def main(first: int, count: int) -> None:
 if __name__ == "__main__":
     mi.set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
-    main(*(int(word) for word in sys.argv[1:3]))
+    main(*(int(word) for word in sys.argv[1:3]), *sys.argv[3:])

@@ -13,6 +13,7 @@ from fuzz import verdict
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
+from fuzz.specular import specular_case_of
 from fuzz.verdict import RIGHT, VARIANT, WRONG, Effort, Look, Outcome, examine
 from variants import activate
 
@@ -38,8 +39,9 @@ def mono() -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
-def test_a_random_scene(mono, seed):
-    case = case_of(seed)
+@pytest.mark.parametrize("draw", [case_of, specular_case_of], ids=["smooth", "specular"])
+def test_a_random_scene(mono, draw, seed):
+    case = draw(seed)
     outcome = examine(case)
     if not outcome.failed:
         return
@@ -58,10 +60,11 @@ def _same(case: Case, outcome: Outcome) -> bool:
     return examine(case).word == outcome.word
 
 
-def test_cases_are_always_the_same_and_load(mono):
+@pytest.mark.parametrize("draw", [case_of, specular_case_of], ids=["smooth", "specular"])
+def test_cases_are_always_the_same_and_load(mono, draw):
     """Also after a round trip through text, which is how a failure is reported; and no two are alike."""
-    texts = [json.dumps(case_of(seed)) for seed in range(LOADED)]
-    assert texts == [json.dumps(case_of(seed)) for seed in range(LOADED)] and len(set(texts)) == LOADED
+    texts = [json.dumps(draw(seed)) for seed in range(LOADED)]
+    assert texts == [json.dumps(draw(seed)) for seed in range(LOADED)] and len(set(texts)) == LOADED
     for text in texts:
         case = json.loads(text)
         assert find_param(build(case["scene"]), case["param"]).differentiable
