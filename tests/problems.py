@@ -25,6 +25,7 @@ class Problem:
     load: dict = field(default_factory=dict)  # overrides of the scene file's <default> values
     options: dict = field(default_factory=dict)  # of the integrators on both sides
     slow: bool = False  # not in the default suite: takes long, or other problems there have its terms and shapes
+    fd_samples: int = 1  # of the thorough run's finite differences, by comparison
     tag: str = ""  # tells apart problems of one scene and parameter
 
     @property
@@ -148,11 +149,11 @@ PROBLEMS = (
     Problem("thinlens_shadow", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("environment_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
     Problem("constant_shadow", "blocker.vertex_positions", 0.006, direction=X, slow=True),
-    Problem("faceted_ball", "blocker.vertex_positions", 0.004, rotate=(1, 1, 0), slow=True),
+    Problem("faceted_ball", "blocker.vertex_positions", 0.004, rotate=(1, 1, 0), slow=True, fd_samples=8),
     Problem("faceted_ball", "blocker.vertex_positions", 0.004, direction=X, slow=True),
     Problem("smooth_ball_shadow", "blocker.vertex_positions", 0.005, direction=X, slow=True),
     Problem("glossy_floor", "blocker.vertex_positions", 0.005, direction=X, slow=True),
-    Problem("baffled_light", "blocker.vertex_positions", 0.005, direction=X, slow=True),
+    Problem("baffled_light", "blocker.vertex_positions", 0.005, direction=X, slow=True, fd_samples=6),
     Problem("cbox", "small-box.vertex_positions", 0.005, direction=X, load={"res": 32, "max_depth": 3}, slow=True),
     # leaves and boxes about a pixel wide: a larger step would take their corners across the borders of pixels
     Problem("branching", "tree.vertex_positions", 0.001, rotate=Y, load={"res": 64}, slow=True),

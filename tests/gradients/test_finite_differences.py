@@ -35,7 +35,7 @@ def test_fast(llvm, problem):
 
 @pytest.mark.parametrize("problem", cases(slow=True))
 def test_thorough(variant, problem):
-    compare(problem, **SLOW)
+    compare(problem, **SLOW | {"reference_spp": SLOW["reference_spp"] * problem.fd_samples})
 
 
 def test_wrong_gradients_are_rejected():

@@ -18,8 +18,9 @@ from psdr_jit.derivative.statistics import block_means, block_test, gain
 SEEDS = 16
 # A camera at a distance sees corners and rims of a pixel's width: with three times this step, finite differences
 # themselves are off by 1.5 % (by 0.7 % with this one, by nothing with a third of it).
-STEP, TURN, PAN = 0.004, 0.004, 0.0003  # of finite differences [scene units, rad]: 0.03 px at most
-FEW, MANY = 4, 24  # samples of finite differences for each one of ours: the smaller the step, the more
+# Steps of finite differences [scene units, rad], 0.03 px at most, and their samples for each one of ours: the smaller
+# the step, the more.
+STEP, TURN, PAN = (0.004, 4), (0.004, 4), (0.0003, 24)
 BLOCK = 4  # [px]
 MAX_Z = 5.0  # standard errors of a block
 FLOOR = 0.01  # of the brightest block: what finite differences of a few pixels' step are off themselves
@@ -107,7 +108,7 @@ def light(kind: str, inside: bool) -> dict:
     return {"type": "rectangle", "to_world": pose, "bsdf": black, "emitter": {"type": "area", "radiance": 15.0}}
 
 
-def assert_agrees(name: str, kind: str, depth: int, param: str, step: float, spp: int = 1024, **how):
+def assert_agrees(name: str, kind: str, depth: int, param: str, step: tuple[float, int], spp: int = 1024, **how):
     """Gain and blocks of the derivative image agree with finite differences."""
     shape, around, (view, fov) = SHAPES[name]
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
@@ -120,7 +121,8 @@ def assert_agrees(name: str, kind: str, depth: int, param: str, step: float, spp
     motion = perturb(scene, param, **how)
     spec = {"type": "psdr_path", "max_depth": depth, "rr_depth": 1000}
     estimate = forward(motion, spec, SEEDS, spp)
-    reference = fd(motion, spec, step, SEEDS, (MANY if step == PAN else FEW) * spp)
+    size, samples = step
+    reference = fd(motion, spec, size, SEEDS, samples * spp)
     slope = gain(estimate, reference[0::2], reference[1::2])
     assert slope.stderr < 0.02, slope
     assert abs(slope.value - 1) < max(TOLERANCE, 3 * slope.stderr), slope
@@ -156,7 +158,6 @@ def test_a_shape_that_moves(llvm, name, kind, depth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind, depth", LIGHTS)
-@pytest.mark.parametrize("name", [name for name in SHAPES if name != "ball"])  # a ball that turns stays as it is
+@pytest.mark.parametrize("name, kind, depth", [case for case in CASES if case[0] != "ball"])  # it stays as it is
 def test_a_shape_that_turns(llvm, name, kind, depth):
     assert_agrees(name, kind, depth, "shape", TURN, 4096, rotate=(0.3, 1, 0))

@@ -80,7 +80,7 @@ def test_it_turns_with_a_single_control_point(llvm, tmp_path, plugin):
 def test_it_is_seen_in_a_shiny_floor(llvm, tmp_path, plugin):
     """The film shows the floor alone; finite differences are noisy."""
     scene = scene_of(tmp_path, plugin, checkered(), target=(0.1, -1.6, -1.4), fov=14, floor=SHINY)
-    assert_gain(scene, "tube.control_points", 3, 0.015, 0.05, 2048, direction=(1, 0, 0))
+    assert_gain(scene, "tube.control_points", 3, 0.015, 0.05, 6144, direction=(1, 0, 0))
 
 
 @pytest.mark.parametrize("plugin", CURVES)
