@@ -95,6 +95,11 @@ def images(
     return shown, moved_images(copy, in_copy, {**spec, "max_depth": depth}, spp, seeds)
 
 
+def test_the_shadow_of_a_sheet_in_a_mirror(llvm):
+    """The quick one."""
+    assert_grad_close(*images("sheet", "point", None, 2, 32, 6), max_stderr=0.05)
+
+
 @slow
 @pytest.mark.parametrize("case", ["sheet", "mirror", "camera", "lamp"])
 def test_a_shadow_in_a_mirror(llvm, case):
