@@ -17,7 +17,8 @@ by a smooth lobe to the other terms.
 Behind the first vertex any segment may step: what a mirror shows, the shadow on it (a shadow ray towards a point of
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
-outlines, creases, curves along which surfaces cut, shading outlines and patterns. Left out is what lies behind more
+outlines, creases, curves along which surfaces cut (both sides a little off them, `chain_outline.beside_cut`), shading
+outlines and patterns. Left out is what lies behind more
 than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along. With light subpaths, what points send
 to the film by way of mirrors and glass steps as well, and is searched from the light's side (`light_chain`).
 """
@@ -47,7 +48,7 @@ from . import light_chain
 from .chain_crossing import adjoint_of_speed, crossings, gradient_of, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
-from .chain_outline import Curve, beside_line
+from .chain_outline import Curve, beside_cut, beside_line
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
@@ -147,6 +148,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
     if lines.world.patterns is not None:
         pair = beside_line(job.scene, pair, curve)
+    pair = beside_cut(job.scene, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
     end = End(pair.sight, curve, pair.in_light, pair.light, source, distance)
 

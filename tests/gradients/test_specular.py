@@ -108,6 +108,19 @@ def test_what_is_not_there_casts_no_shadow(llvm):
     assert_grad_close(-indirect, direct, max_stderr=0.03)
 
 
+def test_glass_that_cuts_into_a_floor(llvm):
+    """Right above the cut, what leaves the glass starts below the floor: it must not see the sky there."""
+    pose = T().translate([0.1, 0, 0.1]).rotate([0.6, 0.8, 0.3], 40).scale(0.4)
+    scene = mi.load_dict({
+        "type": "scene", "camera": camera([-1, -2, 3], [0.1, 0, 0], 22), "sky": {"type": "constant"},
+        "floor": {"type": "rectangle", "to_world": T().scale(2), "bsdf": WHITE},
+        "glass": {"type": "cube", "to_world": pose, "bsdf": DIELECTRIC},
+    }, optimize=False)  # fmt: skip
+    motion = perturb(scene, "floor.to_world", direction=(0.2, 0.1, 1))
+    reference = fd(motion, spec(3), STEP, 2 * SEEDS, 512)
+    assert_grad_close(forward(motion, spec(3), SEEDS, 128), reference, max_stderr=0.06)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("bsdf, plugin", [(DIELECTRIC, "sphere"), (PLASTIC, "rectangle")])
 def test_forward_and_backward_agree(llvm, bsdf, plugin):
