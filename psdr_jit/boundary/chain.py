@@ -18,9 +18,9 @@ Behind the first vertex any segment may step: what a mirror shows, the shadow on
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
 outlines, creases, curves along which surfaces cut (both sides a little off them, `chain_outline.beside_cut`), shading
-outlines and patterns. Left out is what lies behind more
-than `chain_trace.CHAIN_DEPTH` segments, and the steps that lights bring along. With light subpaths, what points send
-to the film by way of mirrors and glass steps as well, and is searched from the light's side (`light_chain`).
+outlines and patterns. Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments, and the steps that
+lights bring along. With light subpaths, what points send to the film by way of mirrors and glass steps as well, and is
+searched from the light's side (`light_chain`).
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_chain
-from .chain_crossing import adjoint_of_speed, crossings, gradient_of, step_per_slope
+from .chain_crossing import adjoint_of_speed, beside_curve, crossings, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
-from .chain_outline import Curve, beside_cut, beside_line
+from .chain_outline import Curve
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
@@ -146,15 +146,12 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     line = lines.line(found.at.sample)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
-    if lines.world.patterns is not None:
-        pair = beside_line(job.scene, pair, curve)
-    pair = beside_cut(job.scene, pair, curve)
+    pair = beside_curve(lines, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
     end = End(pair.sight, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
-    gradient = gradient_of(lines, chain, end, p, lambda q: _first(lines, chain, line, q))
-    valid, step = step_per_slope(curve, line, gradient)
+    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
     if has_rims(job.facts):
         valid &= is_counted(lines, pair, line, curve.line)
     per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)

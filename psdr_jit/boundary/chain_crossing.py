@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.ad import backpropagate, tangents
-from .chain_outline import Curve, crossed_curve
+from .chain_outline import Curve, beside_cut, beside_line, crossed_curve
 from .chain_sweeps import AtRest, slope_at_end
 from .chain_trace import ChainRecords, Pair
 from .searched_lines import SearchedLines
@@ -34,17 +34,22 @@ def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
     return chain, pair, curve
 
 
-def gradient_of(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, first: Callable) -> mi.Vector2f:
-    """(F_x, F_y) at the places `p`; `first` gives the attached starts and directions of the first segments at a place.
-    Detached."""
-    return mi.Vector2f(*(_slope(lines, chain, end, p, axis, first) for axis in (0, 1)))
+def beside_curve(lines: SearchedLines, pair: Pair, curve: Curve) -> Pair:
+    """The last segments clear of a crossed line of a pattern, or of a cut; others as they are."""
+    if lines.world.patterns is not None:
+        pair = beside_line(lines.job.scene, pair, curve)
+    return beside_cut(lines.job.scene, pair, curve)
 
 
-def step_per_slope(curve: Curve, line, gradient: mi.Vector2f) -> tuple[mi.Bool, mi.Float]:
-    """`(valid, −F_X / |∇F|²)` of crossings of the lines `line`."""
-    slope2 = dr.squared_norm(gradient)
-    valid = curve.valid & (dr.square(curve.F) < dr.square(MOST_OFF) * slope2)
-    return valid, -dr.select(line.horizontal, gradient.x, gradient.y) / slope2
+def step_per_slope(lines: SearchedLines, chain: ChainRecords, end, at: tuple, first: Callable):
+    """`(valid, −F_X / |∇F|²)` at `at`: (place, line); `first` gives the attached starts and directions of the first
+    segments at a place. Detached."""
+    p, line = at
+    F_x, F_y = (_slope(lines, chain, end, p, axis, first) for axis in (0, 1))
+    slope2 = dr.square(F_x) + dr.square(F_y)
+    valid = end.curve.valid & (dr.square(end.curve.F) < dr.square(MOST_OFF) * slope2)
+    along = dr.select(line.horizontal, F_x, F_y)
+    return valid, -along / slope2
 
 
 def _slope(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, axis: int, first: Callable) -> mi.Float:

@@ -92,11 +92,7 @@ class Lines(SearchedLines):
 
     def ray(self, line: Line, s: mi.Float) -> mi.Ray3f:
         """The camera ray, behind the emitters that are hidden from the camera."""
-        return self.camera_ray(line, line.at(s))
-
-    def camera_ray(self, line: Line, p: mi.Point2f) -> mi.Ray3f:
-        """The same at the film position `p` [px], which need not be on the line."""
-        ray, _ = self.job.sensor.sample_ray(0, line.wavelength, self.film(p), line.aperture)
+        ray, _ = self.job.sensor.sample_ray(0, line.wavelength, self.film(line.at(s)), line.aperture)
         if not self.job.options.hide_emitters:
             return mi.Ray3f(ray)
         return skip_emitters(self.job.scene, ray, self.job.scene.ray_intersect_preliminary(ray))[0]

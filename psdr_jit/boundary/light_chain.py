@@ -45,9 +45,9 @@ from ..paths.light_walk import take_up
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
-from .chain_crossing import adjoint_of_speed, crossings, gradient_of, step_per_slope
+from .chain_crossing import adjoint_of_speed, beside_curve, crossings, step_per_slope
 from .chain_fixed import Directions
-from .chain_outline import Curve, beside_cut, beside_line
+from .chain_outline import Curve
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
@@ -155,14 +155,11 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     Φ = _intensity(line, line.direction(p), wavelengths) * weight
     ends = pair.a, pair.b
-    if lines.world.patterns is not None:
-        pair = beside_line(job.scene, pair, curve)
-    pair = beside_cut(job.scene, pair, curve)
+    pair = beside_curve(lines, pair, curve)
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 
-    gradient = gradient_of(lines, chain, end, p, lambda q: (line.origin(q), line.direction(q)))
-    valid, step = step_per_slope(curve, line, gradient)
+    valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (line.origin(q), line.direction(q)))
     per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
     for i, hit in enumerate(ends):

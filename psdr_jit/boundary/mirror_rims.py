@@ -38,7 +38,7 @@ FLAT = 1 - 1e-7
 
 def has_rims(facts: SceneFacts) -> bool:
     """May there be any?"""
-    return facts.has_delta_lobes and any(s.smooth and s.is_mesh for s in facts.shapes)
+    return facts.has_delta_lobes and any(s.smooth for s in facts.shapes)
 
 
 @dataclass

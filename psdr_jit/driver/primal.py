@@ -37,9 +37,11 @@ def image_plugin(scene: mi.Scene, hide_emitters: bool) -> str:
     there to be seen: what masks reflect is darker by their opacity [Mitsuba 3.9.1, `src/integrators/path.cpp`,
     `valid_ray`].
     """
-    sky_is_seen = scene.environment() is not None and not hide_emitters
-    passes = any(shape.bsdf().flags() & int(mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf() is not None)
-    return "prb" if passes and not sky_is_seen else "path"
+    if scene.environment() is not None and not hide_emitters:
+        return "path"
+    bsdfs = (shape.bsdf() for shape in scene.shapes())
+    passes = any(bsdf is not None and bsdf.flags() & int(mi.BSDFFlags.Null) for bsdf in bsdfs)
+    return "prb" if passes else "path"
 
 
 def bidirectional_image(call: Call) -> mi.TensorXf | None:

@@ -17,6 +17,7 @@ Case = dict[str, Any]  # seed, scene, param, how (keywords of `perturb`), integr
 
 SALT = 0x5CE4E  # keeps these streams apart from others with the same seeds
 ANALYTIC = ("rectangle", "disk", "sphere", "cylinder")
+SOLID = (*CLOSED, "cube", "sphere")
 CUTTABLE = (*MESHES, "cube", "sphere")  # whose curve with a mesh is looked for
 FLOOR_SIZE = 2.5  # half a side [scene units]
 DISTANCE = 4.0  # of the camera from the middle of the scene
@@ -84,15 +85,20 @@ def _objects(draw: Draw, movable: dict) -> dict:
             shape["emitter"] = {"type": "area", "radiance": draw.number(1, 4)}
             movable["value"].append((f"{name}.emitter.radiance.value", {}))
         else:
-            closed = kind in (*CLOSED, "cube", "sphere")
-            shape["bsdf"] = materials.any_of(draw, f"{name}.bsdf", movable, closed)
+            shape["bsdf"] = materials.any_of(draw, f"{name}.bsdf", movable, closed=kind in SOLID)
             if turned == "upright" and shape["bsdf"]["type"] == "roughdielectric":
                 # what is seen of a floor that coincides with the glass is rounding, and the image jumps as they part
-                shape["to_world"][0] = ["translate", [centre[0], round(centre[1] + LIFT, 3), centre[2]]]
+                lift(shape)
         for _ in range(3):  # objects are moved more often than floors
             _add_motion(draw, movable, name, shape)
         shapes[name] = shape
     return shapes
+
+
+def lift(shape: dict) -> None:
+    """Raise a shape off what it would rest on."""
+    _, (x, y, z) = shape["to_world"][0]
+    shape["to_world"][0] = ["translate", [x, round(y + LIFT, 3), z]]
 
 
 def _shape(draw: Draw, kind: str) -> dict:

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 from fuzz.draw import Draw
-from fuzz.meshes import CLOSED
-from fuzz.scenes import LIFT, Case, case_of
+from fuzz.scenes import SOLID, Case, case_of, lift
 
 SALT = 0x61A55  # keeps these streams apart from others with the same seeds
 SHARE = 0.6  # of the objects; of each scene, one at least
 FLOOR_SHARE = 0.3
-SOLID = (*CLOSED, "cube", "sphere")
 
 
 def specular_case_of(seed: int) -> Case:
@@ -28,8 +26,8 @@ def specular_case_of(seed: int) -> Case:
         shape = scene[name]
         closed = shape.get("mesh", shape["type"]) in SOLID and name != "floor"
         shape["bsdf"] = _solid(draw) if closed else _thin(draw)
-        if closed:
-            _lift(shape)
+        if closed and _rests(shape):
+            lift(shape)  # what is seen of a floor that coincides with glass is rounding
     case["integrator"] |= {
         "form": draw.one(["spatial", "auto"]),
         "max_depth": draw.weighted({2: 2, 3: 4, 4: 3, 5: 1}),
@@ -37,11 +35,9 @@ def specular_case_of(seed: int) -> Case:
     return case
 
 
-def _lift(shape: dict) -> None:
-    """Off what it would rest on: what is seen of a floor that coincides with glass is rounding."""
+def _rests(shape: dict) -> bool:
     (_, centre), (_, size) = shape["to_world"][0], shape["to_world"][-1]
-    if centre[1] == size:
-        shape["to_world"][0] = ["translate", [centre[0], round(centre[1] + LIFT, 3), centre[2]]]
+    return centre[1] == size
 
 
 def _solid(draw: Draw) -> dict:
