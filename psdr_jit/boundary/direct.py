@@ -278,5 +278,5 @@ TERM = Term(
         lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job) + horizon_weights(job, NAME, direct=True),
         "no light sees the others as an outline, or they are coplanar",
     ),
-    through_edges=True,
+    guided=3,
 )

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compaction import compact
-from ..core.line_guide import NO_CELL, Drawn
+from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
@@ -203,8 +203,8 @@ def view(line: HorizonLine, r: mi.Float) -> EdgeView:
     at = EdgeLocation(line.row, line.t, on.x + r * on.ω, mi.Point3f(0), mi.Float(0))
     # with the distance as lead, rays beside the edge start at x_D
     sight = Sight(at, on.ω, r, on.n, on.offset, lead=r)
-    drawn = Drawn(mi.UInt32(NO_CELL), mi.Float(1))
-    return EdgeView(line.lane, sight, end, line.weight * (cos * per_length(on, r)), line.pdf, line.wavelengths, drawn)
+    value = line.weight * (cos * per_length(on, r))
+    return EdgeView(line.lane, sight, end, value, line.pdf, line.wavelengths, Drawn.otherwise())
 
 
 def trace_views(job: Job, horizons: SampledHorizons, line: HorizonLine) -> EdgeView | None:

@@ -191,5 +191,5 @@ TERM = Term(
         lambda job: line_weights(job, USES[job.form]) + horizon_weights(job, NAME, direct=False),
         "the others are coplanar, or lie inside of closed surfaces",
     ),
-    through_edges=True,
+    guided=3,
 )

@@ -17,7 +17,6 @@ The value of the estimator is 0, only its derivative is not. Both sides are trac
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +24,7 @@ import mitsuba as mi
 from ..core import film as films
 from ..core.ad import accumulate, backpropagate, tangents
 from ..core.compaction import compact
+from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
@@ -32,30 +32,21 @@ from ..core.varying import varying
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
-from ..edges.scene_table import scene_edges
-from ..edges.table import EdgeTable, look_beside
+from ..edges.table import look_beside
 from ..options import Options
 from ..paths.walk import NoSink, skip_emitters, walk
 from ..plan.job import Job
-from ..plan.motion import Displacements
+from ..plan.motion import Displacements, Motion
 from ..plan.plan import Geometry
 from ..plan.reasons import steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
-from ..sampling.distribution import stratified
-from ..sampling.rows import ROW_SAMPLER, RowSampler, edge_samples, row_state
+from ..sampling.film_edges import FilmEdges, film_edges, film_weights
+from ..sampling.guided import guided
+from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
 from .mirror_rims import has_rims, look_beyond
 
 NAME = "primary"
-
-
-@dataclass(frozen=True)
-class PrimaryEdges:
-    """What can be seen to move, and how its rows are drawn."""
-
-    table: EdgeTable
-    rows: RowSampler
-    state: Any  # of `rows`
 
 
 @dataclass
@@ -65,8 +56,9 @@ class EdgeSample:
     row: mi.UInt32
     t: mi.Float
     aperture: mi.Point2f
-    pdf: mi.Float  # of row and t, times the number of samples
+    pdf: mi.Float  # of row and t and by the guide, times the number of samples
     lane: mi.UInt32
+    drawn: Drawn
 
 
 @dataclass
@@ -94,29 +86,10 @@ class Steps:
     alpha: mi.Float  # the same of the coverage
     wavelengths: mi.Color0f
     valid: mi.Bool
+    drawn: Drawn
 
 
-def film_weights(job: Job) -> list[mi.Float]:
-    """By kind of edge, the weight of each row: of moving shapes, or of all if the camera moves."""
-    table = scene_edges(job)
-    border = job.film.rfilter().border_size() if job.film.sample_border() else 0
-    weights = table.weights(lambda kind: kind.film_weights(job.frame, border))
-    if job.facts.camera_moves or not job.plan.prunes:
-        return weights
-    return [dr.select(moves, w, 0) for w, moves in zip(weights, table.moving(), strict=True)]
-
-
-def primary_edges(job: Job) -> PrimaryEdges | None:
-    """Edges that can move on the film. None: nothing can."""
-    return edges_of_rows(job, row_state(job, NAME, lambda: film_weights(job)))
-
-
-def edges_of_rows(job: Job, state: Any | None) -> PrimaryEdges | None:
-    """Edges whose rows are drawn as `state` says."""
-    return None if state is None else PrimaryEdges(scene_edges(job), job.call.memory[ROW_SAMPLER], state)
-
-
-def seen_edge(job: Job, edges: PrimaryEdges, sample: EdgeSample) -> SeenEdge:
+def seen_edge(job: Job, edges: FilmEdges, sample: EdgeSample) -> SeenEdge:
     """The edge points as the sensor sees them."""
     on = edges.table.on(sample.row, sample.t, viewpoint(job.frame, sample.aperture))
     view = look_at(job.frame, on.x, sample.aperture)
@@ -125,16 +98,18 @@ def seen_edge(job: Job, edges: PrimaryEdges, sample: EdgeSample) -> SeenEdge:
     return SeenEdge(sight, view, across, on.valid & view.valid & (across > 0))
 
 
-def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample | None:
+def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     """Stratified samples on the edges; those that the sensor does not see are left out (their value is 0)."""
     lower, upper = job.frame.window
     count = edge_samples(job, paths=2)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
-    row, t = edges.rows.sample(edges.state, stratified(count, rng.next_1d()))
-    aperture = rng.next_2d() if job.frame.kind == "thinlens" else mi.Point2f(0.5)
-    pdf = edges.rows.pdf(edges.state, row, t) * varying(mi.Float, count)
-    sample = EdgeSample(row, t, aperture, pdf, lane)
+    jitter = rng.next_1d()
+    x, u, drawn = guided(job, count, jitter, rng.next_2d())
+    row, t = edges.rows.sample(edges.state, x)
+    aperture = u if job.frame.kind == "thinlens" else mi.Point2f(0.5)
+    pdf = edges.rows.pdf(edges.state, row, t) * (varying(mi.Float, count) * drawn.p)
+    sample = EdgeSample(row, t, aperture, pdf, lane, drawn)
 
     seen = seen_edge(job, edges, sample)
     view, p = seen.view, seen.view.p
@@ -152,7 +127,7 @@ def sample_visible(job: Job, edges: PrimaryEdges) -> EdgeSample | None:
     return compact(sample, active & ~blocked)
 
 
-def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
+def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     """Radiance and coverage on the − and + side of every sample: `(L, alpha, wavelengths)`, 2 lanes each."""
     n = dr.width(sample.row)
     index = dr.arange(mi.UInt32, 2 * n)
@@ -176,9 +151,9 @@ def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
     return L, alpha, wavelengths
 
 
-def _steps(job: Job) -> tuple[PrimaryEdges, Steps] | None:
+def _steps(job: Job) -> tuple[FilmEdges, Steps] | None:
     """Everything about the samples but how fast they move; None if there are none."""
-    edges = primary_edges(job)
+    edges = film_edges(job, NAME, lambda: film_weights(job))
     if edges is None:
         return None
     sample = sample_visible(job, edges)
@@ -202,14 +177,15 @@ def per_motion(seen: SeenEdge, sample: EdgeSample) -> mi.Float:
     return seen.across / (seen.view.J_px * sample.pdf)
 
 
-def steps_at(job: Job, edges: PrimaryEdges, seen: SeenEdge, sample: EdgeSample, values: tuple) -> Steps:
+def steps_at(job: Job, edges: FilmEdges, seen: SeenEdge, sample: EdgeSample, values: tuple) -> Steps:
     """Samples ready to be moved; `values`: (contribution, coverage, wavelengths)."""
     sight, view = seen.sight, seen.view
     turn = edges.table.turn(sight.at, view.ω, sight.n_perp) if job.facts.camera_moves else mi.Vector3f(0)
-    return Steps(sight.at, view.ω, sight.n_perp, turn, view.p, view.film, sample.aperture, *values, seen.valid)
+    place = (view.p, view.film, sample.aperture)
+    return Steps(sight.at, view.ω, sight.n_perp, turn, *place, *values, seen.valid, sample.drawn)
 
 
-def motion_across(job: Job, edges: PrimaryEdges, steps: Steps, moving: Displacements) -> mi.Float:
+def motion_across(job: Job, edges: FilmEdges, steps: Steps, moving: Displacements) -> mi.Float:
     """How fast the edges move across the film, attached; value 0."""
     relative = moving.of_edge(edges.table, steps.at, steps.ω)
     if not job.facts.camera_moves:
@@ -231,9 +207,22 @@ def forward(job: Job) -> mi.TensorXf:
         if found is None:
             return films.black(job.film)
         edges, steps = found
-        with job.motion.attached() as moving:
-            motion = tangents(motion_across(job, edges, steps, moving))
+        motion = _speed(job, edges, steps, job.motion)
+        _tell(job, steps, dr.max(dr.abs(steps.value)) * motion)
         return _splat(job, steps, motion)
+
+
+def _speed(job: Job, edges: FilmEdges, steps: Steps, motion: Motion) -> mi.Float:
+    """How fast the edges move across the film, as `motion` has it. Detached."""
+    with motion.attached() as moving:
+        return tangents(motion_across(job, edges, steps, moving))
+
+
+def _tell(job: Job, steps: Steps, contribution: mi.Float) -> None:
+    """Let whoever listens know what every sample brings."""
+    if job.tally is not None:
+        lane = dr.arange(mi.UInt32, dr.width(steps.p))
+        job.tally.add(steps.drawn, lane, dr.select(steps.valid, contribution, 0), job.spp)
 
 
 def backward(job: Job, grad_in: mi.TensorXf) -> None:
@@ -246,6 +235,8 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
         λ = _adjoint(job, steps, grad_in)
         # Stored: each entry of a pose is a sum over all samples, in a kernel that would compute all this anew.
         dr.eval(λ, steps)
+        if job.tally is not None:
+            _tell(job, steps, λ * _speed(job, edges, steps, job.probe))
         with job.motion.attached() as moving:
             accumulate(λ * motion_across(job, edges, steps, moving))
 
@@ -283,4 +274,5 @@ TERM = Term(
     forward=forward,
     backward=backward,
     edges=EdgeSampling(film_weights, "the others rest, are coplanar, turn away or leave the film"),
+    guided=1,
 )

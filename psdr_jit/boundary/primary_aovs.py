@@ -18,23 +18,22 @@ from ..edges.table import look_beside
 from ..paths.aovs import Aovs
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
-from ..sampling.rows import row_state
+from ..sampling.film_edges import FilmEdges, film_edges, film_weights
 from . import primary
 
 
-def _edges(job: Job) -> primary.PrimaryEdges | None:
-    """`primary_edges` without those at which no more than the shade of one surface steps."""
+def _edges(job: Job) -> FilmEdges | None:
+    """Those of the primary term without those at which no more than the shade of one surface steps."""
     kinds = scene_edges(job).kinds
     if not any(kind.shades_only for kind in kinds):
-        return primary.primary_edges(job)
-    state = row_state(job, f"{primary.NAME}/surfaces", lambda: [
+        return film_edges(job, primary.NAME, lambda: film_weights(job))
+    return film_edges(job, f"{primary.NAME}/surfaces", lambda: [
         dr.zeros(mi.Float, kind.count) if kind.shades_only else weights
-        for kind, weights in zip(kinds, primary.film_weights(job), strict=True)
+        for kind, weights in zip(kinds, film_weights(job), strict=True)
     ])  # fmt: skip
-    return primary.edges_of_rows(job, state)
 
 
-def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.EdgeSample) -> list[mi.Float]:
+def _jumps(job: Job, aovs: Aovs, edges: FilmEdges, sample: primary.EdgeSample) -> list[mi.Float]:
     """A_− − A_+ of every sample, by channel."""
     n = dr.width(sample.row)
     index = dr.arange(mi.UInt32, 2 * n)
@@ -48,7 +47,7 @@ def _jumps(job: Job, aovs: Aovs, edges: primary.PrimaryEdges, sample: primary.Ed
     return [dr.gather(mi.Float, value, even) - dr.gather(mi.Float, value, even + 1) for value in values]
 
 
-def _steps(job: Job, aovs: Aovs) -> tuple[primary.PrimaryEdges, primary.Steps, list[mi.Float]] | None:
+def _steps(job: Job, aovs: Aovs) -> tuple[FilmEdges, primary.Steps, list[mi.Float]] | None:
     """Samples, and their contributions per unit of motion by channel; None if there are none."""
     edges = _edges(job)
     sample = None if edges is None else primary.sample_visible(job, edges)

@@ -24,7 +24,7 @@ from ..core.ad import accumulate, backpropagate, tangents
 from ..core.line_guide import Drawn
 from ..edges.location import EdgeLocation
 from ..plan.job import Job, passes
-from ..plan.motion import Displacements
+from ..plan.motion import Displacements, Motion
 from ..sampling.rows import SampledRows
 from .sensor_subpath import SubpathRecords
 
@@ -137,14 +137,18 @@ def _derivative_image(job: Job, term: SecondaryTerm) -> mi.TensorXf:
     if found is None:
         return films.black(job.film)
     edges, s = found
-    with job.motion.attached() as moving:
+    motion = job.call.counters.rejected.keep_finite(mi.Color1f(_speed(job, edges, s, job.motion))).x
+    if job.tally is not None and s.drawn is not None:
+        job.tally.add(s.drawn, s.records.lane_of(), dr.max(dr.abs(s.value)) * motion, job.spp)
+    return _splat(job, s, motion)
+
+
+def _speed(job: Job, edges: SampledRows, s: BoundarySamples, motion: Motion) -> mi.Float:
+    """How fast every connection moves (flat), as `motion` has it. Detached."""
+    with motion.attached() as moving:
         m = _motion(job, edges, s, moving)
         at_edge, connect, go_on, camera = tangents(m.segment, m.connect, m.go_on, m.camera)
-    motion = dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
-    motion = job.call.counters.rejected.keep_finite(mi.Color1f(motion)).x
-    if job.tally is not None and s.drawn is not None:
-        job.tally.add(s.drawn, s.records.lane_of(), dr.max(dr.abs(s.value)) * motion)
-    return _splat(job, s, motion)
+    return dr.gather(mi.Float, at_edge, s.records.lane_of()) + s.records.before(go_on) + connect + camera
 
 
 def _accumulate_adjoint(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> None:
@@ -159,6 +163,8 @@ def _accumulate_adjoint(job: Job, term: SecondaryTerm, grad_in: mi.TensorXf) -> 
         backpropagate(_splat(job, s, motion), grad_in)
         δ = dr.grad(motion)
     δ = job.call.counters.rejected.keep_finite(mi.Color1f(δ)).x
+    if job.tally is not None and s.drawn is not None:
+        job.tally.add(s.drawn, s.records.lane_of(), δ * _speed(job, edges, s, job.probe), job.spp)
     after = s.records.after(δ)
     total = s.records.total(δ, after)
     with job.motion.attached() as moving:

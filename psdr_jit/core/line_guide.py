@@ -3,17 +3,20 @@
 A line is drawn by three numbers in [0, 1): x picks the edge and the place on it, u the direction (`edges/wedges.py`,
 `sampling/directions.py`). Whatever these mean, the term is ∫ f(x, u) dx du over the unit cube, f the contribution over
 the line's density. Most lines bring nothing: they end where no light comes from, or where the sensor does not look.
-So the cube is divided into cells, the numbers are drawn with a density p that is constant in each of them, and f is
-divided by p. The least variance has p ∝ √E[f²] in every cell, which the pilot's samples tell: Σ c² p, c = f/p their
-contributions, estimates the integral of f² over a cell. A share of the lines is spread evenly: p is never 0, and
-weights are bounded. How large it is, and whether there is a guide at all, is for one half of the pilot to say of a
-guide made from the other: a few large contributions tell little about where the next ones are.
+So the cube is divided into boxes, the numbers are drawn with a density p that is constant in each of them, and f is
+divided by p. The least variance has p ∝ √E[f²] in every box, which samples tell: Σ c² p, c = f/p their contributions,
+estimates the integral of f² over a box, whatever guide they were drawn by. How finely it is worth to divide, and
+whether at all, one half of the samples tells of the other (`guide_tree.py`). A share of the lines is spread evenly: p
+is never 0, and weights are bounded.
 
-The map from even numbers to guided ones is monotonous in each of them, so that stratification carries over.
+The map from even numbers to guided ones halves box by box. It is monotonous in x, whatever the direction: lanes that
+are sorted along the edges stay so, and stratification carries over.
 """
 
 from __future__ import annotations
 
+import base64
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,134 +24,171 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .levels import packed, unpacked
+from .guide_tree import BROAD, FINE, LEAF, Tree, grown
 from .upload import uploaded
+from .varying import varying
 
-#: Cells: of the edges, in the order of their rows, and of either random number of the direction.
-GROUPS, BINS = 16, 8
-SHAPE = (GROUPS, BINS, BINS)
-
-#: Shares of the lines that may be spread evenly.
-EVEN_SHARES = (0.2, 0.5)
+#: Share of the lines that is spread evenly: no weight is larger than 1 over it.
+EVEN_SHARE = 0.2
 
 #: Factor between second moments from which a guide is worth having.
-LEAST_GAIN = 1.5
+LEAST_GAIN = 1.3
+
+#: Steps of a probability in a guide's text.
+STEPS = 254
 
 
 @dataclass
 class Drawn:
     """How a line was drawn. Detached."""
 
-    cell: mi.UInt32  # NO_CELL: in another way
+    x: mi.Float  # its numbers; x < 0: in another way
+    u: mi.Point2f
     p: mi.Float  # density in the unit cube
 
-
-#: Number of no cell.
-NO_CELL = GROUPS * BINS * BINS
+    @staticmethod
+    def otherwise() -> Drawn:
+        """Not by a guide's numbers."""
+        return Drawn(mi.Float(-1), mi.Point2f(0), mi.Float(1))
 
 
 class LineTally:
-    """What lines of each cell have brought to the film. Host object with a device table."""
+    """What lines of each cell have brought to the film, in two independent halves. Host object with device tables."""
+
+    #: Cells of a half: of x and of either number of the direction.
+    SHAPES = ((FINE[0], FINE[1], FINE[1]), (BROAD[0], BROAD[1], BROAD[1]))
 
     def __init__(self):
-        self._moments = dr.zeros(mi.Float, NO_CELL + 1)
-        dr.make_opaque(self._moments)
+        self._tables = [dr.zeros(mi.Float, 4 * int(np.prod(shape))) for shape in self.SHAPES]
+        dr.make_opaque(self._tables)
 
-    def add(self, drawn: Drawn, lane: mi.UInt32, contribution: mi.Float) -> None:
-        """Contributions to the film, each of line `lane`."""
+    def add(self, drawn: Drawn, lane: mi.UInt32, contribution: mi.Float, spp: int) -> None:
+        """Contributions to the film, each of line `lane`, of a pass of `spp` samples per pixel."""
         of = dr.gather(Drawn, drawn, lane)
-        worth = dr.square(contribution) * of.p
-        dr.scatter_add(self._moments, worth, of.cell, dr.isfinite(worth) & (worth > 0))
+        worth = dr.square(contribution * varying(mi.Float, spp)) * of.p
+        active = dr.isfinite(worth) & (worth > 0) & (of.x >= 0)
+        for table, (groups, bins, _) in zip(self._tables, self.SHAPES, strict=True):
+            i, j, k = (dr.minimum(mi.UInt32(v * n), n - 1) for v, n in ((of.x, groups), (of.u.x, bins), (of.u.y, bins)))
+            cell = (((lane & 1) * groups + i) * bins + j) * bins + k
+            dr.scatter_add(table, worth, cell, active)
+            dr.scatter_add(table, dr.square(worth), cell + 2 * groups * bins * bins, active)
+        dr.schedule(self._tables)
 
-    @property
-    def moments(self) -> np.ndarray:
-        """Relative integrals of f², `SHAPE`."""
-        return np.array(self._moments, np.float64)[:NO_CELL].reshape(SHAPE)
+    def sums(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of w = c² p and of w², by half and cell, (2, 2, *shape) for each of `SHAPES`. Waits for them.
+
+        Those of w are relative integrals of f².
+        """
+        return tuple(
+            np.array(table, np.float64).reshape(2, 2, *shape)
+            for table, shape in zip(self._tables, self.SHAPES, strict=True)
+        )
+
+    def fade(self, share: float) -> None:
+        """Let what was heard up to now count for `share` of itself: the scene may change."""
+        self._tables = [table * varying(mi.Float, share) for table in self._tables]  # Σw² as well: n fades, too
+        dr.eval(self._tables)
+
+    def guide(self) -> tuple[LineGuide | None, float]:
+        """`(guide, gain)` as far as the halves confirm each other, the gain of second moments; None: not worth it."""
+        tree = grown(*self.sums())
+        gain = (1 - EVEN_SHARE) / tree.left
+        return (LineGuide.of(tree), gain) if gain >= LEAST_GAIN else (None, 1.0)
 
 
 @dataclass(frozen=True)
 class LineGuide:
-    """Density of lines in the unit cube, by cell. Host object, plain text."""
+    """Density of lines in the unit cube, constant in boxes. Host object, plain text."""
 
-    levels: str
-
-    @staticmethod
-    def of(moments: np.ndarray, even: float) -> LineGuide | None:
-        """From the integrals of f² in each cell, with a share of `even` lines; None if they are 0."""
-        root = np.sqrt(_smoothed(moments))
-        return LineGuide(packed(even + (1 - even) * root / root.mean())) if root.mean() > 0 else None
+    nodes: str  # of the tree: the axis of each node, and the probability of its lower part
 
     @staticmethod
-    def between(few: np.ndarray, more: np.ndarray, weight: float) -> tuple[LineGuide | None, float]:
-        """`(guide, gain)` from two halves of a pilot, `few` to be weighed by `weight`; None: none is worth it."""
-
-        def told(even: float) -> float:
-            guides = LineGuide.of(few, even), LineGuide.of(more, even)
-            if None in guides:
-                return 1.0
-            return float(np.sqrt(guides[0].gain(more) * guides[1].gain(few)))
-
-        gain, even = max((told(even), even) for even in EVEN_SHARES)
-        if gain < LEAST_GAIN:
-            return None, 1.0
-        return LineGuide.of(weight * few + more, even), gain
+    def of(tree: Tree) -> LineGuide:
+        """The density of a tree, and `EVEN_SHARE` of the lines spread evenly."""
+        steps = np.clip(np.round(_with_even_share(tree) * STEPS), 1, STEPS - 1).astype(np.uint8)
+        return LineGuide(base64.b64encode(zlib.compress(tree.axis.tobytes() + steps.tobytes())).decode())
 
     @cached_property
-    def density(self) -> np.ndarray:
-        """`SHAPE`, mean 1."""
-        return unpacked(self.levels, SHAPE)
+    def tree(self) -> Tree:
+        """Its nodes. Raises ValueError or zlib.error for a text that is none."""
+        axis, steps = np.frombuffer(zlib.decompress(base64.b64decode(self.nodes)), np.uint8).reshape(2, -1)
+        divided = int((axis != LEAF).sum())
+        if axis.max(initial=0) > LEAF or 2 * divided + 1 != len(axis) or not ((steps > 0) & (steps < STEPS)).all():
+            raise ValueError("its guide is no tree")
+        return Tree(axis, steps / STEPS, 1.0)
 
-    def gain(self, moments: np.ndarray) -> float:
-        """By which factor the second moment falls if integrals of f² are `moments`."""
-        guided = float((moments / self.density).sum())
-        return float(moments.sum()) / guided if guided > 0 else 1.0
+    def require_tree(self) -> None:
+        """Raises ValueError or zlib.error unless the text is that of a tree."""
+        _ = self.tree
+
+    @property
+    def key(self) -> int:
+        """A number of its own, for random numbers of its own."""
+        return zlib.crc32(self.nodes.encode())
 
     def tables(self) -> GuideTables:
         """The same on the device."""
-        cells = self.density
-        bins, groups = cells.sum(2), cells.sum((1, 2))
-        return GuideTables(*(
-            uploaded(mi.Float, (np.cumsum(w, -1) / w.sum(-1, keepdims=True)).ravel()) for w in (groups, bins, cells)
-        ))  # fmt: skip
+        tree = self.tree
+        first = np.where(tree.axis != LEAF, 2 * np.cumsum(tree.axis != LEAF) - 1, 0)
+        return GuideTables(uploaded(mi.UInt32, tree.axis), uploaded(mi.UInt32, first), uploaded(mi.Float, tree.lower))
 
 
-def _smoothed(moments: np.ndarray) -> np.ndarray:
-    """A little of every neighbour's in the square of directions, which wraps around in neither number."""
-    padded = np.pad(moments, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    near = sum(np.roll(padded, shift, axis)[:, 1:-1, 1:-1] for shift in (-1, 1) for axis in (1, 2))
-    return (4 * moments + near) / 8
+def _with_even_share(tree: Tree) -> np.ndarray:
+    """Probability of the lower part of every node if `EVEN_SHARE` of the lines are spread evenly over the cube."""
+    inner = np.flatnonzero(tree.axis != LEAF)
+    mass, volume = np.ones(len(tree.axis)), np.ones(len(tree.axis))
+    for number, node in enumerate(inner):  # parts come after what they are parts of
+        a, b = 2 * number + 1, 2 * number + 2
+        mass[a], mass[b] = mass[node] * tree.lower[node], mass[node] * (1 - tree.lower[node])
+        volume[a] = volume[b] = volume[node] / 2
+    mixed = EVEN_SHARE * volume + (1 - EVEN_SHARE) * mass
+    lower = np.full(len(tree.axis), 0.5)
+    lower[inner] = mixed[2 * np.arange(len(inner)) + 1] / mixed[inner]
+    return lower
 
 
 @dataclass
 class GuideTables:
-    """Cumulative probabilities: of groups, of bins of the first number by group, of the second by both. Detached."""
+    """The nodes of a guide's tree. Detached."""
 
-    groups: mi.Float
-    first: mi.Float
-    second: mi.Float
+    axis: mi.UInt32
+    first: mi.UInt32  # the lower part; the upper one is the next
+    lower: mi.Float  # its probability
 
+    @dr.syntax
     def draw(self, x: mi.Float64, u: mi.Point2f) -> tuple[mi.Float64, mi.Point2f, Drawn]:
         """Guided numbers for even ones, and how they were drawn."""
-        group, x, p_x = _inverted(self.groups, mi.UInt32(0), GROUPS, x)
-        i, u_x, p_i = _inverted(self.first, group * BINS, BINS, u.x)
-        row = group * BINS + i
-        j, u_y, p_j = _inverted(self.second, row * BINS, BINS, u.y)
-        return x, mi.Point2f(u_x, u_y), Drawn(row * BINS + j, mi.Float(p_x) * p_i * p_j)
+        x, v, w = mi.Float64(x), mi.Float(u.x), mi.Float(u.y)  # in the box
+        start_x, start_v, start_w = mi.Float64(0), mi.Float(0), mi.Float(0)  # of the box
+        size_x, size_v, size_w = mi.Float64(1), mi.Float(1), mi.Float(1)
+        p = mi.Float(1)
+        node = dr.zeros(mi.UInt32, dr.width(x))
+        axis = dr.gather(mi.UInt32, self.axis, node)
+        while dr.hint(axis != LEAF, label="psdr.guide", exclude=[self]):
+            share = dr.gather(mi.Float, self.lower, node)
+            x, start_x, size_x, in_x = _halved(x, start_x, size_x, share, axis == 0)
+            v, start_v, size_v, in_v = _halved(v, start_v, size_v, share, axis == 1)
+            w, start_w, size_w, in_w = _halved(w, start_w, size_w, share, axis == 2)
+            upper = in_x | in_v | in_w
+            p *= 2 * dr.select(upper, 1 - share, share)
+            node = dr.gather(mi.UInt32, self.first, node) + dr.select(upper, mi.UInt32(1), 0)
+            axis = dr.gather(mi.UInt32, self.axis, node)
+        x, v, w = start_x + x * size_x, start_v + v * size_v, start_w + w * size_w
+        u = mi.Point2f(v, w)
+        return x, u, Drawn(mi.Float(x), u, p)
 
 
-def _inverted(cumulative: mi.Float, start: mi.UInt32, n: int, u):
-    """`(bin, number in [0, 1), density)` of the piecewise constant density with n bins from `start`."""
-    kind = type(u)
-    found = mi.UInt32(0)
-    for i in range(n - 1):
-        found += dr.select(u >= kind(dr.gather(mi.Float, cumulative, start + i)), mi.UInt32(1), 0)
-    upper = kind(dr.gather(mi.Float, cumulative, start + found))
-    lower = dr.select(found > 0, kind(dr.gather(mi.Float, cumulative, start + found - 1, found > 0)), 0)
-    place = dr.clip((u - lower) / (upper - lower), 0, dr.one_minus_epsilon(mi.Float))
-    return found, dr.minimum((kind(found) + place) / n, dr.one_minus_epsilon(mi.Float)), (upper - lower) * n
+def _halved(value, start, size, lower: mi.Float, active: mi.Bool):
+    """`(number, start, size, upper)` of the half of a box that an even number in [0, 1) falls into, where active."""
+    kind = type(value)
+    q = kind(lower)
+    upper = active & (value >= q)
+    inside = dr.select(upper, (value - q) / (1 - q), value / q)
+    value = dr.select(active, dr.clip(inside, 0, dr.one_minus_epsilon(mi.Float)), value)
+    size = dr.select(active, size / 2, size)
+    return value, dr.select(upper, start + size, start), size, upper
 
 
 def evenly(x: mi.Float64, u: mi.Point2f) -> Drawn:
     """How numbers are drawn without a guide."""
-    i, j = (mi.UInt32(v * BINS) for v in (u.x, u.y))
-    return Drawn((mi.UInt32(x * GROUPS) * BINS + i) * BINS + j, mi.Float(1))
+    return Drawn(mi.Float(x), mi.Point2f(u), mi.Float(1))

@@ -7,6 +7,8 @@ from enum import IntEnum
 import drjit as dr
 import mitsuba as mi
 
+from .varying import varying
+
 
 class Stream(IntEnum):
     """One entry per independent consumer of random numbers; the value enters the seed, so never reuse one."""
@@ -35,6 +37,13 @@ class Stream(IntEnum):
     LIGHT_CHAIN_PILOT = 21
     SPHERE_RIMS = 22
     SPHERE_RIM_PATHS = 23
+
+
+def other_seed(seed: int | mi.UInt32, key: int) -> mi.UInt32:
+    """A seed for random numbers that are independent of those of `seed`, by `key`."""
+    derived = mi.sample_tea_32(mi.UInt32(seed), varying(mi.UInt32, key))[0]
+    dr.make_opaque(derived)
+    return derived
 
 
 def stream_seed(seed: int | mi.UInt32, stream: Stream) -> mi.UInt32:

@@ -14,11 +14,18 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
+from ..core.line_guide import LineTally
 from .film_noise import FORGET, coarse
 from .pilot import REFRESH, Measurement, variance_of_pair
 
 #: Pairs of images that are looked at in a row, and from then on one in so many calls.
 EAGER, SELDOM = 8, 16
+
+#: Calls in a row whose lines tell what they bring, and from then on one in so many: it takes a few per cent of a call.
+ATTENTIVE, SOMETIMES = 16, 4
+
+#: What lines have brought before a guide was made counts for this share of itself in the next one.
+FADED = 0.5
 
 
 @dataclass
@@ -42,6 +49,21 @@ class NoiseLog:
     def epoch(self) -> int:
         """Number of the pilot."""
         return self.calls // REFRESH
+
+    @property
+    def listens(self) -> bool:
+        """Is this a call whose lines are to tell what they bring?"""
+        return self.calls < ATTENTIVE or self.calls % SOMETIMES == 0
+
+    @property
+    def guides_due(self) -> bool:
+        """Is this a call at which guides may change? A power of four: there has to be much more to go by."""
+        return self.calls > 1 and self.calls & (self.calls - 1) == 0 and self.calls.bit_length() % 2 == 1
+
+    def heard(self, form: str, name: str) -> LineTally | None:
+        """What the lines of a term have brought up to now, to which this call may add."""
+        noise = None if self.current is None else self.current.noise.get(form, {}).get(name)
+        return None if noise is None else noise.heard
 
     @property
     def due(self) -> bool:
@@ -83,3 +105,5 @@ class NoiseLog:
         for (form, name, n), seen in over_film.items():
             self.current = self.current.seen_on_film(form, name, sum(seen) / len(seen), n, len(seen))
         self.pending.clear()
+        if self.guides_due:
+            self.current = self.current.guided(FADED)

@@ -37,6 +37,10 @@ REFRESH = 256
 #: Least and largest number of a term's paths relative to equal budgets: the pilot may have missed something rare.
 LEAST, MOST = 1 / 8, 8.0
 
+#: From here on a guide over one random number takes more from well spread samples than it gives: it goes by their
+#: second moment, and they have much less variance than that.
+STRATIFIED = 1.1
+
 #: Between independent samples and stratified ones of a smooth function of one variable.
 SLOWEST, FASTEST = 1.0, 3.0
 
@@ -51,6 +55,8 @@ class TermNoise:
     even_cost: float  # the same if paths are spread evenly over the film
     film: FilmNoise | None = None  # where it is noisy, if its samples are spread over the film
     lines: LineGuide | None = None  # which lines through edges are worth it, if it samples any
+    gain: float = 1.0  # of their second moment, by that guide
+    heard: LineTally | None = None  # what lines have brought, of which the guide is made
 
     @staticmethod
     def between(few: float, more: float, cost: float) -> TermNoise:
@@ -69,11 +75,12 @@ class TermNoise:
         even = float(self.film.effort.mean())
         return replace(self, cost=cost_of_segment * self.film.segments, even_cost=cost_of_segment * even)
 
-    def guided(self, few: LineTally, more: LineTally) -> TermNoise:
-        """With lines as the pilot has found them worth; as much better as one half of it tells of the other."""
-        # c is f over the number of samples, and there are as many c²
-        lines, gain = LineGuide.between(few.moments, more.moments, (FEW / MORE) ** 2)
-        return replace(self, at_more=self.at_more / gain, lines=lines)
+    def guided(self) -> TermNoise:
+        """With lines as they have been found worth; as much better as one half of what was heard tells of the other."""
+        if self.heard is None:
+            return self
+        lines, gain = self.heard.guide()
+        return replace(self, at_more=self.at_more * self.gain / gain, lines=lines, gain=gain)
 
     def at(self, n: float) -> float:
         return self.at_more * (n / MORE) ** -self.p
@@ -108,6 +115,15 @@ class Measurement:
         terms = {**self.noise[form], name: replace(term, film=term.film.seen(variance, n, calls))}
         return Measurement({**self.noise, form: terms})
 
+    def guided(self, fade: float) -> Measurement:
+        """With guides made anew; what they were made of counts for the share `fade` of itself from now on."""
+        noise = {form: {name: term.guided() for name, term in terms.items()} for form, terms in self.noise.items()}
+        for terms in noise.values():
+            for term in terms.values():
+                if term.heard is not None:
+                    term.heard.fade(fade)
+        return Measurement(noise)
+
     def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
         """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""
         terms = {name: self.noise[form][name] for name in self.noise[form] if name in names}
@@ -140,12 +156,12 @@ def measure(
     for form in forms:
         found[form] = {}
         for term in (t for t in TERMS if t.name in names):
-            tallies = {spp: LineTally() if term.through_edges else None for spp in (FEW, MORE)}
+            tally = LineTally() if term.guided else None
             traced = [] if term.cost_of_segment is not None else None
             few, more = (
                 _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally, effort=traced))
                            for k in range(IMAGES)])
-                for spp, tally in tallies.items()
+                for spp in (FEW, MORE)
             )  # fmt: skip
             job = job_of(form, FIRST_SEED, FEW)
             dearer = term.with_light if job.light is not None else 1
@@ -154,8 +170,8 @@ def measure(
                 noise = noise.spread(few, more, _effort(traced, job) if traced else None)
             if traced:
                 noise = noise.measured(dearer * term.cost_of_segment)
-            if term.through_edges:
-                noise = noise.guided(tallies[FEW], tallies[MORE])
+            if term.guided > 1 or noise.p < STRATIFIED:
+                noise = replace(noise, heard=tally).guided()
             found[form][term.name] = noise
     return Measurement(found)
 

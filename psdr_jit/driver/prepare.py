@@ -14,7 +14,9 @@ import mitsuba as mi
 
 from ..core.counters import Counters
 from ..core.film import require_film
+from ..core.line_guide import LineTally
 from ..core.memory import Memory, Slot
+from ..core.streams import other_seed
 from ..edges.convexity import lone_convex
 from ..edges.followed_lights import followed_lights
 from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
@@ -24,7 +26,7 @@ from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
 from ..plan.job import Job, tubes_of_call
 from ..plan.light_plan import plan_light
-from ..plan.motion import SceneMotion
+from ..plan.motion import Motion, SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
@@ -47,6 +49,9 @@ BY_NOISE = "by measured noise, of terms, pixels and lines, as costly as equal on
 
 #: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
 NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)
+#: Of one render call: the motion of everything that can move, once it has been asked for.
+PROBE: Slot[Motion | None] = Slot(lambda: None)
+
 PILOTS: Slot[dict[tuple, dict[int, Measurement]]] = Slot(dict)
 
 
@@ -79,12 +84,23 @@ class _Question:
         """May budgets follow the measured noise?"""
         return self.call.options.plan == "lean" and not self.call.options.budgets_set
 
-    def job(self, plan: Plan, spp: int, term: TermPlan | None = None) -> Job:
-        """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes."""
+    def job(self, plan: Plan, spp: int, term: TermPlan | None = None, tally: LineTally | None = None) -> Job:
+        """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes. `tally`: listens."""
         tubes = tubes_of_call(self.call, self.facts, self.shared)
         film, lines = (None, None) if term is None else (term.film, term.lines)
         motion = SceneMotion(self.call.sensor, tubes)
-        return Job(self.call, self.facts, plan, motion, self.shared, spp, film, lines)
+        # What a guide has learned from must be independent of what it draws, also if a seed comes back.
+        call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
+        probe = self.probe if tally is not None and call.mode == "backward" else None
+        return Job(call, self.facts, plan, motion, self.shared, spp, film, lines, tally, probe)
+
+    @property
+    def probe(self) -> Motion:
+        """The motion of everything that can move, found once per render call."""
+        if self.shared[PROBE] is None:
+            tubes = tubes_of_call(self.call, self.facts, self.shared)
+            self.shared[PROBE] = probe_motion(self.call.scene, self.facts, tubes)
+        return self.shared[PROBE]
 
 
 def prepare(call: Call) -> Prepared:
@@ -109,8 +125,12 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t)) for t in plan.running], log,
-                    lambda spp: question.job(plan, spp))  # fmt: skip
+    listens = log is not None and question.automatic and log.listens
+
+    def job(t: TermPlan) -> Job:
+        return question.job(plan, t.spp, t, log.heard(plan.form, t.name) if listens else None)
+
+    return Prepared(plan, [(by_name[t.name], job(t)) for t in plan.running], log, lambda spp: question.job(plan, spp))
 
 
 def _require_unfrozen() -> None:
@@ -251,11 +271,10 @@ def _pilot(q: _Question, plan: Plan, forms: tuple[str, ...], names: list[str], e
     """The pilot of this epoch; run unless an integrator with the same memory has done so."""
     found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
-        motion = probe_motion(q.call.scene, q.facts, tubes_of_call(q.call, q.facts, q.shared))
 
         def job_of(form: str, seed: int, spp: int) -> Job:
             call = replace(q.call, seed=seed, counters=Counters())
-            return Job(call, q.facts, replace(plan, form=form), motion, q.shared, spp)
+            return Job(call, q.facts, replace(plan, form=form), q.probe, q.shared, spp)
 
         found.clear()
         found[epoch] = pilot.measure(job_of, forms, names, q.call.scene.environment() is not None)

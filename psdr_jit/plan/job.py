@@ -52,6 +52,7 @@ class Job:
     density: FilmDensity | None = None  # where on the film samples of this term are wanted; None: everywhere
     guide: LineGuide | None = None  # which lines through edges are; None: all alike
     tally: LineTally | None = None  # wants to know what lines bring
+    probe: Motion | None = None  # where there is a tally: the motion that backward mode, which knows none, tells of
     effort: list[np.ndarray] | None = None  # gets what is traced for each pixel of the sampled window [segments]
 
     @property

@@ -123,10 +123,11 @@ def _term_plan(data: dict) -> TermPlan:
     edges, film, lines = data.pop("edges"), data.pop("film", None), data.pop("lines", None)
     edges = None if edges is None else EdgeCount(**edges)
     film = None if film is None else FilmDensity(tuple(film["shape"]), film["levels"])
-    lines = None if lines is None else LineGuide(lines["levels"])
-    for table in (film and film.relative, lines and lines.density):
-        if table is not None and not np.isfinite(table).all():
-            raise ValueError("its samples have no place")
+    lines = None if lines is None else LineGuide(lines["nodes"])
+    if film is not None and not np.isfinite(film.relative).all():
+        raise ValueError("its samples have no place")
+    if lines is not None:
+        lines.require_tree()
     term = TermPlan(**{**data, "streams": tuple(data["streams"])}, edges=edges, film=film, lines=lines)
     if not (isinstance(term.name, str) and isinstance(term.runs, bool) and type(term.spp) is int):
         raise TypeError("a term has a name, runs or not, and has a whole number of paths per pixel")

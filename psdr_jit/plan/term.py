@@ -45,7 +45,7 @@ class Term:
     forward: Callable[[Job], mi.TensorXf]
     backward: Callable[[Job, mi.TensorXf], None]
     edges: EdgeSampling | None = None
-    through_edges: bool = False  # its samples are lines through edges that can be guided
+    guided: int = 0  # random numbers of a sample that a guide may choose: 3 of a line through an edge, 1 of a point
     with_light: float = 1.0  # factor on the cost where light subpaths run
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy
     cost_of_segment: float | None = None  # as `cost`, if samples tell how much they trace (`Job.effort`)
