@@ -71,7 +71,9 @@ def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -
     if n == 0:
         return dr.zeros(mi.Spectrum, dr.width(lane))
     slot = slots(records, kept)
-    by_depth, final, followed = _both_sides(job, table, dr.gather(EdgeView, view, kept), longest_path(job) + 1)
+    seen = dr.gather(EdgeView, view, kept)
+    dr.eval(seen)  # in one kernel, see `compact`
+    by_depth, final, followed = _both_sides(job, table, seen, longest_path(job) + 1)
     needed = dr.gather(mi.Bool, useful, lane)
     slot = 2 * dr.gather(mi.UInt32, slot, lane)
 

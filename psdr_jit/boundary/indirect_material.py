@@ -83,6 +83,7 @@ def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
         return dr.zeros(mi.Spectrum, dr.width(lane))
     slot = slots(records, kept)
     s = dr.gather(Background, b, kept)
+    dr.eval(s)  # in one kernel, see `compact`
     ray = mi.Ray3f(s.source.o, s.source.d, 0, s.view.wavelengths)
     pi, vertices = s.source.intersection(), longest_path(job) + 1
     by_depth, final = radiance_by_depth(job, ray, pi, s.view.lane, vertices, mi.Bool(True), mi.Bool(False))

@@ -11,10 +11,14 @@ T = TypeVar("T")
 
 
 def compact(record: T, active: mi.Bool) -> T | None:
-    """The lanes of `record` (a dataclass of arrays) that are active; None if there are none. Evaluates.
+    """The lanes of `record` (a dataclass of arrays) that are active; None if there are none. Evaluated.
 
-    All fields are evaluated in one kernel first: a gather from pending arrays would launch one for each.
+    All fields in one kernel, before and after: a gather from pending arrays would launch one for each.
     """
     dr.eval(record, active)
     kept = dr.compress(active)
-    return dr.gather(type(record), record, kept) if dr.width(kept) > 0 else None
+    if dr.width(kept) == 0:
+        return None
+    found = dr.gather(type(record), record, kept)
+    dr.eval(found)
+    return found

@@ -88,6 +88,7 @@ def _adjoint(
         backpropagate(develop(value), grad_in)
         adjoint = dr.grad(value)
     clear(film)
+    dr.eval(adjoint)  # in one kernel: a gather from it would launch one for each channel
     return adjoint
 
 

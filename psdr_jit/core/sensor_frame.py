@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..errors import UnsupportedError
 from .film import sampled_window
@@ -84,8 +85,7 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         ray, _ = sensor.sample_ray(0, 0.5, corners, mi.Point2f(0.5))  # the lens centre, for a thin lens
         o, d = to_local @ ray.o, to_local @ ray.d
         q = mi.Point2f(o.x, o.y) if kind == "orthographic" else mi.Point2f(d.x / d.z, d.y / d.z)
-        x, y, near = (list(map(float, axis)) for axis in (q.x, q.y, o.z))
-        far = near[0] + float((ray.maxt * d.z)[0])
+        x, y, near, far = (_on_host(axis) for axis in (q.x, q.y, o.z, o.z + ray.maxt * d.z))
         focus, aperture = 1.0, 0.0
         if kind == "thinlens":
             params = mi.traverse(sensor)
@@ -99,7 +99,7 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         corner=varying(mi.Point2f, (x[0], y[0])),
         extent=varying(mi.Point2f, (x[1] - x[0], y[2] - y[0])),
         near=varying(mi.Float, near[0]),
-        far=varying(mi.Float, far),
+        far=varying(mi.Float, far[0]),
         focus=varying(mi.Float, focus),
         aperture=varying(mi.Float, aperture),
         crop_offset=tuple(film.crop_offset()),
@@ -107,6 +107,11 @@ def sensor_frame(sensor: mi.Sensor) -> SensorFrame:
         stretch=_stretch(to_world),
         window=tuple(tuple(map(float, corner)) for corner in sampled_window(film)),
     )
+
+
+def _on_host(values) -> list[float]:
+    """All entries, read at once."""
+    return np.array(values, np.float64).ravel().tolist()
 
 
 def film_area(sensor: mi.Sensor, kind: str) -> mi.Float:
@@ -144,19 +149,17 @@ def lens_point(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Point3f:
 
 def origin_box(frame: SensorFrame) -> tuple[list[float], list[float]]:
     """Bounding box `(lower, upper)` of lens and near plane, between which camera rays start, world space."""
+    (x0, y0), (w, h) = _on_host(frame.corner), _on_host(frame.extent)
+    (near,), (r,) = _on_host(frame.near), _on_host(frame.aperture)
     if frame.kind == "orthographic":
-        x0, y0 = float(frame.corner.x[0]), float(frame.corner.y[0])
-        x1, y1 = x0 + float(frame.extent.x[0]), y0 + float(frame.extent.y[0])
-        near = float(frame.near[0])
-        local = [(x, y, near) for x in (x0, x1) for y in (y0, y1)]
+        local = [(x, y, near) for x in (x0, x0 + w) for y in (y0, y0 + h)]
     else:
-        r, near = float(frame.aperture[0]), float(frame.near[0])
-        (x0, y0), (w, h) = ((float(v.x[0]), float(v.y[0])) for v in (frame.corner, frame.extent))
         local = [(x, y, 0.0) for x in (-r, r) for y in (-r, r)]
         local += [(near * x + a, near * y + b, near) for x in (x0, x0 + w) for y in (y0, y0 + h)
                   for a in (-r, r) for b in (-r, r)]  # fmt: skip
-    points = frame.to_world @ mi.Point3f(*(mi.Float(column) for column in zip(*local, strict=True)))
-    return [float(dr.min(c)[0]) for c in points], [float(dr.max(c)[0]) for c in points]
+    matrix = np.array(frame.to_world.matrix, np.float64).reshape(4, 4)
+    points = np.array(local) @ matrix[:3, :3].T + matrix[:3, 3]
+    return points.min(0).tolist(), points.max(0).tolist()
 
 
 def viewpoint(frame: SensorFrame, aperture_sample: mi.Point2f) -> mi.Vector4f:

@@ -69,10 +69,19 @@ def _is_inside(shape: mi.Shape, facts: ShapeFacts, rows: EdgeRows, reach: float)
     positions, faces = dr.detach(mesh_positions(shape)), mesh_faces(shape)
     a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in (faces.x, faces.y, faces.z))
     n = dr.normalize(dr.cross(b - a, c - a))
-    offset = dr.dot(n, a)
+    offset = dr.dot(n, a) - depth
     dr.eval(n, offset)
-    inside = mi.Bool(True)
-    for k in range(facts.faces):
-        n_k, offset_k = dr.gather(type(n), n, k), dr.gather(mi.Float, offset, k)
-        inside &= dr.maximum(dr.dot(n_k, rows.p0), dr.dot(n_k, rows.p1)) < offset_k - depth
-    return inside
+    return _behind_all(n, offset, rows.p0, rows.p1)
+
+
+@dr.syntax
+def _behind_all(n: mi.Vector3f, offset: mi.Float, a: mi.Point3f, b: mi.Point3f) -> mi.Bool:
+    """Do points lie behind all planes n·x = offset? In one kernel, however many planes there are."""
+    k, count = mi.UInt32(0), varying(mi.UInt32, dr.width(offset))
+    inside = dr.full(mi.UInt32, 1, dr.width(a))
+    while dr.hint((k < count) & (inside != 0), label="psdr.buried"):
+        n_k = dr.gather(type(n), n, k)
+        farthest = dr.maximum(dr.dot(n_k, a), dr.dot(n_k, b))
+        inside = dr.select(farthest < dr.gather(mi.Float, offset, k), inside, 0)
+        k += 1
+    return inside != 0

@@ -68,4 +68,5 @@ def camera_passes(job: Job) -> Iterator[CameraPass]:
         rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
         ray, weight, p = camera_rays(job.sensor, samples, rng, lane)
         at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
+        dr.eval(dr.detach(ray), weight, p, at.weight)  # at once: films are written and read after paths are traced
         yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at)
