@@ -46,6 +46,10 @@ class PathSpaceIntegrator(TermIntegrator):
        - |string|
        - `lean` leaves out what is certainly 0, `full` computes everything, for comparison; or the text of a plan that
          was made before (`Plan.to_json`), which is then executed as it is (Default: lean)
+     * - guide
+       - |string|
+       - `auto`: which edges and which directions are sampled is learned from a pilot and earlier calls where that pays;
+         `on`: wherever it can be; `off`: not at all. Not with budgets (Default: auto)
      * - aovs
        - |string|
        - Further channels of image and derivative, as `dd:depth, nn:sh_normal`: `depth`, `position`, `sh_normal`,

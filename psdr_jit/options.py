@@ -24,6 +24,9 @@ DIRECTIONS = ("any", "known")
 #: comparison.
 LIGHT_PATHS = ("off", "auto", "only")
 
+#: Guides of samples on edges: where the noise that is known says that they pay; wherever one can be made; none.
+GUIDES = ("auto", "on", "off")
+
 #: The options that hold a term's samples per pixel, and which of them follows another one where it is not set.
 BUDGETS = ("sppc", "sppp", "spps", "sppi", "sppd")
 FOLLOWS = {"sppd": "sppi", "spps": "sppp"}
@@ -50,6 +53,7 @@ class Options:
     form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
     plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS
+    guide: str = "auto"  # one of GUIDES
     aovs: str = ""  # further channels of the image, "name:kind, ...", see `paths.aovs`
     more_budgets: tuple[tuple[str, int | None], ...] = ()  # of terms that bring a budget of their own, by name
     light_paths: str = "off"  # one of LIGHT_PATHS; a property of the integrators that can trace them
@@ -67,7 +71,7 @@ class Options:
             self._require_type(name, value, None)
             if value is not None and value < 0:
                 raise OptionError(f"{name} = {value}: use a count >= 0 (0 switches the term off)")
-        for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS),
+        for name, words in (("form", ("auto", *FORMS)), ("plan", PLANS), ("direction", DIRECTIONS), ("guide", GUIDES),
                             ("light_paths", LIGHT_PATHS)):  # fmt: skip
             if getattr(self, name) not in words and not (name == "plan" and self.plan_is_given):
                 raise OptionError(f"{name} = {getattr(self, name)!r}: use {', '.join(words[:-1])} or {words[-1]}")

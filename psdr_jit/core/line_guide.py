@@ -89,11 +89,11 @@ class LineTally:
         self._tables = [table * varying(mi.Float, share) for table in self._tables]  # Σw² as well: n fades, too
         dr.eval(self._tables)
 
-    def guide(self) -> tuple[LineGuide | None, float]:
+    def guide(self, least_gain: float = LEAST_GAIN) -> tuple[LineGuide | None, float]:
         """`(guide, gain)` as far as the halves confirm each other, the gain of second moments; None: not worth it."""
         tree = grown(*self.sums())
         gain = (1 - EVEN_SHARE) / tree.left
-        return (LineGuide.of(tree), gain) if gain >= LEAST_GAIN else (None, 1.0)
+        return (LineGuide.of(tree), gain) if gain >= least_gain and len(tree.axis) > 1 else (None, 1.0)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.film import sampled_window
-from ..core.line_guide import LineGuide, LineTally
+from ..core.line_guide import LEAST_GAIN, LineGuide, LineTally
 from ..plan.job import Job
 from .film_noise import FilmNoise, coarse
 from .terms import TERMS
@@ -57,6 +57,7 @@ class TermNoise:
     lines: LineGuide | None = None  # which lines through edges are worth it, if it samples any
     gain: float = 1.0  # of their second moment, by that guide
     heard: LineTally | None = None  # what lines have brought, of which the guide is made
+    least_gain: float = LEAST_GAIN  # from which there is a guide
 
     @staticmethod
     def between(few: float, more: float, cost: float) -> TermNoise:
@@ -79,7 +80,7 @@ class TermNoise:
         """With lines as they have been found worth; as much better as one half of what was heard tells of the other."""
         if self.heard is None:
             return self
-        lines, gain = self.heard.guide()
+        lines, gain = self.heard.guide(self.least_gain)
         return replace(self, at_more=self.at_more * self.gain / gain, lines=lines, gain=gain)
 
     def at(self, n: float) -> float:
@@ -149,14 +150,17 @@ class Measurement:
 
 
 def measure(
-    job_of: Callable[[str, int, int], Job], forms: Iterable[str], names: Iterable[str], sky: bool
+    job_of: Callable[[str, int, int], Job], forms: Iterable[str], names: Iterable[str], sky: bool, guide: str = "auto"
 ) -> Measurement:
-    """Run the pilot for `forms` and the terms `names`. `job_of(form, seed, spp)`: a job with a probe's motion."""
+    """Run the pilot for `forms` and the terms `names`. `job_of(form, seed, spp)`: a job with a probe's motion.
+
+    `guide`: one of `options.GUIDES`.
+    """
     found: dict[str, dict[str, TermNoise]] = {}
     for form in forms:
         found[form] = {}
         for term in (t for t in TERMS if t.name in names):
-            tally = LineTally() if term.guided else None
+            tally = LineTally() if term.guided and guide != "off" else None
             traced = [] if term.cost_of_segment is not None else None
             few, more = (
                 _variance([term.forward(replace(job_of(form, FIRST_SEED + k, spp), tally=tally, effort=traced))
@@ -170,8 +174,9 @@ def measure(
                 noise = noise.spread(few, more, _effort(traced, job) if traced else None)
             if traced:
                 noise = noise.measured(dearer * term.cost_of_segment)
-            if term.guided > 1 or noise.p < STRATIFIED:
-                noise = replace(noise, heard=tally).guided()
+            if term.guided > 1 or noise.p < STRATIFIED or guide == "on":
+                least = 0.0 if guide == "on" else LEAST_GAIN
+                noise = replace(noise, heard=tally, least_gain=least).guided()
             found[form][term.name] = noise
     return Measurement(found)
 

@@ -263,7 +263,7 @@ def _geometry(q: _Question, prunes: bool) -> Geometry:
 def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:
     """What calls of one kind have in common, whatever their budgets."""
     o, sensor = q.call.options, q.call.sensor
-    options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction, o.light_paths)
+    options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction, o.guide, o.light_paths)
     return (q.facts.enabled, q.facts.sensor.name, tuple(sensor.film().crop_size()), options, forms)
 
 
@@ -277,7 +277,8 @@ def _pilot(q: _Question, plan: Plan, forms: tuple[str, ...], names: list[str], e
             return Job(call, q.facts, replace(plan, form=form), q.probe, q.shared, spp)
 
         found.clear()
-        found[epoch] = pilot.measure(job_of, forms, names, q.call.scene.environment() is not None)
+        sky = q.call.scene.environment() is not None
+        found[epoch] = pilot.measure(job_of, forms, names, sky, q.call.options.guide)
     return found[epoch]
 
 

@@ -44,6 +44,19 @@ def test_they_change_at_powers_of_four_and_in_between_not(llvm):
     assert seen[0] == seen[1] == seen[2] == seen[3] != seen[4] == seen[5]
 
 
+@pytest.mark.parametrize("guide", ["off", "on"])
+def test_they_can_be_switched(llvm, guide):
+    motion = perturb(scene_of("area_shadow"), BLOCKER, (1, 0, 0))
+    integrator = integrator_specs.build({**SPEC, "max_depth": 2, "guide": guide})
+    for seed in range(5):
+        rendered(motion, integrator, seed)
+        assert all((lines is not None) == (guide == "on") for name, lines in lines_of(integrator).items()
+                   if name != "interior")  # fmt: skip
+    motion.restore()
+    with pytest.raises(RuntimeError, match="guide = 'maybe': use auto, on or off"):
+        mi.load_dict({"type": "psdr_path", "guide": "maybe"})
+
+
 def test_both_modes_draw_the_same_lines_after_learning(llvm):
     scene = scene_of("baffled_light")
     motion, integrator = perturb(scene, BLOCKER, (1, 0, 0)), integrator_specs.build(SPEC)
