@@ -47,6 +47,9 @@ class Tree:
     left: float  # share of the second moment that is left, as either half of the samples tells of the other
 
 
+UNDIVIDED = Tree(np.array([LEAF], np.uint8), np.array([0.5]), 1.0)
+
+
 @dataclass(frozen=True)
 class _Nodes:
     """Boxes of one size, (2, ...) by half of the samples: their moments, and the share that is left of each."""

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .guide_tree import BROAD, FINE, LEAF, Tree, grown
+from .guide_tree import BROAD, FINE, LEAF, UNDIVIDED, Tree, grown
 from .upload import uploaded
 from .varying import varying
 
@@ -86,14 +86,16 @@ class LineTally:
 
     def fade(self, share: float) -> None:
         """Let what was heard up to now count for `share` of itself: the scene may change."""
-        self._tables = [table * varying(mi.Float, share) for table in self._tables]  # Σw² as well: n fades, too
-        dr.eval(self._tables)
+        # on the host, where no kernel has to be compiled for it; Σw² as well: n fades, too
+        self._tables = [uploaded(mi.Float, share * table.ravel()) for table in self.sums()]
 
-    def guide(self, least_gain: float = LEAST_GAIN) -> tuple[LineGuide | None, float]:
-        """`(guide, gain)` as far as the halves confirm each other, the gain of second moments; None: not worth it."""
+    def guide(self, least_gain: float = LEAST_GAIN) -> tuple[LineGuide, float]:
+        """`(guide, gain)` as far as the halves confirm each other, the gain of second moments; where that is less than
+        `least_gain`, a guide without preferences: later ones, which may have some, need no other kernels.
+        """
         tree = grown(*self.sums())
         gain = (1 - EVEN_SHARE) / tree.left
-        return (LineGuide.of(tree), gain) if gain >= least_gain and len(tree.axis) > 1 else (None, 1.0)
+        return (LineGuide.of(tree), gain) if gain >= least_gain else (LineGuide.of(UNDIVIDED), 1.0)
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,11 @@ class LineGuide:
         """The density of a tree, and `EVEN_SHARE` of the lines spread evenly."""
         steps = np.clip(np.round(_with_even_share(tree) * STEPS), 1, STEPS - 1).astype(np.uint8)
         return LineGuide(base64.b64encode(zlib.compress(tree.axis.tobytes() + steps.tobytes())).decode())
+
+    @property
+    def prefers(self) -> bool:
+        """Are lines not spread evenly?"""
+        return len(self.tree.axis) > 1
 
     @cached_property
     def tree(self) -> Tree:
@@ -130,7 +137,9 @@ class LineGuide:
         """The same on the device."""
         tree = self.tree
         first = np.where(tree.axis != LEAF, 2 * np.cumsum(tree.axis != LEAF) - 1, 0)
-        return GuideTables(uploaded(mi.UInt32, tree.axis), uploaded(mi.UInt32, first), uploaded(mi.Float, tree.lower))
+        # one node more than there is: of arrays with a single entry Dr.Jit would make other kernels
+        axis, first, lower = (np.append(column, column[-1]) for column in (tree.axis, first, tree.lower))
+        return GuideTables(uploaded(mi.UInt32, axis), uploaded(mi.UInt32, first), uploaded(mi.Float, lower))
 
 
 def _with_even_share(tree: Tree) -> np.ndarray:

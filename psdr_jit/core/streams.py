@@ -41,7 +41,8 @@ class Stream(IntEnum):
 
 def other_seed(seed: int | mi.UInt32, key: int) -> mi.UInt32:
     """A seed for random numbers that are independent of those of `seed`, by `key`."""
-    derived = mi.sample_tea_32(mi.UInt32(seed), varying(mi.UInt32, key))[0]
+    stored = varying(mi.UInt32, seed) if isinstance(seed, int) else mi.UInt32(seed)
+    derived = mi.sample_tea_32(stored, varying(mi.UInt32, key))[0]
     dr.make_opaque(derived)
     return derived
 

@@ -21,9 +21,6 @@ from .pilot import REFRESH, Measurement, variance_of_pair
 #: Pairs of images that are looked at in a row, and from then on one in so many calls.
 EAGER, SELDOM = 8, 16
 
-#: Calls in a row whose lines tell what they bring, and from then on one in so many: it takes a few per cent of a call.
-ATTENTIVE, SOMETIMES = 16, 4
-
 #: What lines have brought before a guide was made counts for this share of itself in the next one.
 FADED = 0.5
 
@@ -49,11 +46,6 @@ class NoiseLog:
     def epoch(self) -> int:
         """Number of the pilot."""
         return self.calls // REFRESH
-
-    @property
-    def listens(self) -> bool:
-        """Is this a call whose lines are to tell what they bring?"""
-        return self.calls < ATTENTIVE or self.calls % SOMETIMES == 0
 
     @property
     def guides_due(self) -> bool:

@@ -125,12 +125,10 @@ def prepare(call: Call) -> Prepared:
         reasons = "; ".join(dict.fromkeys(term.reason for term in plan.terms))
         warnings.warn(f"the derivative is 0: {reasons}", ZeroDerivativeWarning, stacklevel=5)
     by_name = {term.name: term for term in TERMS}
-    listens = log is not None and question.automatic and log.listens
-
-    def job(t: TermPlan) -> Job:
-        return question.job(plan, t.spp, t, log.heard(plan.form, t.name) if listens else None)
-
-    return Prepared(plan, [(by_name[t.name], job(t)) for t in plan.running], log, lambda spp: question.job(plan, spp))
+    listens = log is not None and question.automatic  # in every call: others would need kernels of their own
+    tallies = {t.name: log.heard(plan.form, t.name) if listens else None for t in plan.running}
+    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t, tallies[t.name])) for t in plan.running], log,
+                    lambda spp: question.job(plan, spp))  # fmt: skip
 
 
 def _require_unfrozen() -> None:

@@ -102,9 +102,13 @@ def test_what_was_heard_fades(llvm):
     assert tally.sums()[1][0].sum() == pytest.approx(0.25 * before)
 
 
-def test_nothing_heard_and_nothing_particular_make_no_guide(llvm):
-    assert LineTally().guide() == (None, 1.0)
-    assert heard(f=lambda x, u: 1 + 0.2 * x).guide() == (None, 1.0)
+def test_nothing_heard_and_nothing_particular_make_a_guide_without_preferences(llvm):
+    for tally in (LineTally(), heard(f=lambda x, u: 1 + 0.2 * x)):
+        guide, gain = tally.guide()
+        assert not guide.prefers and gain == 1
+        x, u = even()
+        guided_x, guided_u, drawn = guide.tables().draw(x, u)
+        assert dr.allclose(guided_x, x) and dr.allclose(guided_u, u) and dr.all(drawn.p == 1)
 
 
 @pytest.mark.parametrize("axis, steps", [([0, 3], [9, 9]), ([0, 3, 4], [9, 9, 9]), ([0, 3, 3], [0, 9, 9]), ([], [])])
