@@ -44,11 +44,15 @@ class DeltaRecords:
         self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
         self.turns = DeltaTurn(dr.zeros(mi.Vector3f, size), dr.zeros(mi.Vector3f, size))
         self.leaves = dr.zeros(mi.Bool, lanes)  # by lane: does the path leave its first vertex by a delta lobe?
-        dr.make_opaque(self.turns, self.leaves)
+        self.mirrored = dr.zeros(mi.Bool, lanes)  # by one that reflects?
+        dr.make_opaque(self.turns, self.leaves, self.mirrored)
 
-    def write(self, k: mi.UInt32, turn: DeltaTurn, delta: mi.Bool, active: mi.Bool) -> None:
+    def write(self, k: mi.UInt32, turn: DeltaTurn, delta: mi.Bool, through: mi.Bool, active: mi.Bool) -> None:
+        """`delta`: by such a lobe, which leads `through` the surface or reflects."""
         dr.scatter(self.turns, turn, k * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
-        dr.scatter(self.leaves, delta, self.lane, active & (k == 0), mode=dr.ReduceMode.Permute)
+        first = active & (k == 0)
+        dr.scatter(self.leaves, delta, self.lane, first, mode=dr.ReduceMode.Permute)
+        dr.scatter(self.mirrored, delta & ~through, self.lane, first, mode=dr.ReduceMode.Permute)
 
     def motion(self, hit: Hit, moving: Displacements) -> mi.Float:
         """Attached b·(direction that leaves), the arrival fixed, of every vertex `hit` (flat arrays)."""

@@ -18,6 +18,7 @@ from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, Sight
+from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
 from ..plan.job import Job
@@ -90,6 +91,9 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
         n_perp = dr.select(turn & (on.aside == 0), -n_perp, n_perp)  # a contour's leads off its surface either way
         down, pi = dr.select(turn, up, down), dr.select(turn, other, pi)
         pdf_sa = dr.select(open_end, pdf_sa + through.pdf_reversed, pdf_sa)
+    valid = line.valid & pi.is_valid()
+    if job.facts.has_delta_lobes:  # smooth lobes receive nothing there
+        valid &= ~lies_within(on.x, pi, down)
     view = EdgeView(
         lane=line.lane,
         sight=Sight.of(on, line.row, line.t, ω, pi.t + on.lead, n_perp),
@@ -99,7 +103,17 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
         wavelengths=line.wavelengths,
         drawn=line.drawn,
     )
-    return compact(view, line.valid & pi.is_valid())
+    return compact(view, valid)
+
+
+def lies_within(x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:
+    """Does `ray` from an edge point x lie within the plane of what it meets, as far as rounding tells?
+
+    It then meets a face of the edge itself, or one in line with it, where it should pass along. A mirror there would
+    receive it with a weight of 1/(n·ω).
+    """
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
+    return dr.abs(dr.dot(si.n, x - si.p)) <= ROUNDING * dr.max(dr.abs(x))
 
 
 def slots(records: SubpathRecords, kept: mi.UInt32) -> mi.UInt32:

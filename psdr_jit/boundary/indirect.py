@@ -16,6 +16,8 @@ The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond th
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -59,6 +61,12 @@ def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples
         source_motion=lambda moving: mi.Float(0),
         drawn=view.drawn,
     )
+
+
+def evaluate_horizons(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples:
+    """The same of horizons; those that mirrors show are edges (`edges.kind_mirror_horizon`)."""
+    found = evaluate(job, edges, view)
+    return replace(found, value=found.records.not_mirrored(found.value))
 
 
 def _step(job: Job, table: EdgeTable, view: EdgeView, records: SubpathRecords) -> mi.Spectrum:
@@ -134,7 +142,7 @@ HORIZONS = {
         evaluate=worth,
     )
     for form, trace, worth in (
-        ("spatial", horizons.trace_views, evaluate),
+        ("spatial", horizons.trace_views, evaluate_horizons),
         ("material", horizons.trace_backgrounds, indirect_material.evaluate),
     )
 }

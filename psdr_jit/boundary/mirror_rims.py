@@ -57,7 +57,7 @@ class Rim:
         bent &= dr.abs(dr.dot(si.n, n_s)) < FLAT
         corners = [_at_corner(pi, uv, si.wavelengths, bent) for uv in CORNERS]
         face = Face([corner.p for corner in corners], [corner.sh_frame.n for corner in corners])
-        n, m = face.normal(pi.prim_uv), face.gradient(d)
+        n, m = face.normal(pi.prim_uv), face.gradient(d, pi.prim_uv)
         end = dr.norm(n) * dr.dot(si.n, d) / (2 * dr.dot(si.n, n_s))
         slope = dr.norm(m)
         across = dr.norm(m - dr.dot(m, d) * d) / slope

@@ -108,6 +108,13 @@ class SubpathRecords:
         """Connections (flat) whose path leaves its first vertex, and does not end there, by a delta lobe."""
         return (self.vertex_of() > 0) & dr.gather(mi.Bool, self.delta.leaves, self.lane_of())
 
+    def not_mirrored(self, values: mi.Spectrum) -> mi.Spectrum:
+        """`values` (flat) but of connections whose path leaves its first vertex as by a mirror, of which they are 0."""
+        if self.delta is None:
+            return values
+        mirrored = (self.vertex_of() > 0) & dr.gather(mi.Bool, self.delta.mirrored, self.lane_of())
+        return dr.select(mirrored, 0, values)
+
     def connected(self) -> mi.Bool:
         """Per lane: does any vertex see the sensor?"""
         return _connected(self)
@@ -190,7 +197,7 @@ def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> Su
     walk_to_sensor(job, receivers, lane_sampler(stream_seed(job.seed, stream), receivers.lane), limits, records)
     dr.eval(records.data)
     if records.delta is not None:
-        dr.eval(records.delta.turns, records.delta.leaves)
+        dr.eval(records.delta.turns, records.delta.leaves, records.delta.mirrored)
     return records
 
 
@@ -268,7 +275,9 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
         if records.delta is not None:
             delta = onward.alive & onward.scattering.delta
             turned, bent = through_vertex(pi, si, bsdf, b, -following.d, -ray.d, delta)
-            records.delta.write(path.k - 1, DeltaTurn(-following.d, dr.select(delta, b, 0)), delta, active)
+            through = dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.sh_frame.n, following.d) > 0
+            turn = DeltaTurn(-following.d, dr.select(delta, b, 0))
+            records.delta.write(path.k - 1, turn, delta, through, active)
             a, b = a + bent, turned
         path = onward.path
         ray = following

@@ -55,10 +55,12 @@ def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
 def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory, so: str = STEPS_OF_FACES) -> None:
     """Name meshes whose shading normals are more than `limit` degrees off their faces, once each; `so`: what follows.
 
-    For meshes that shine or mirror: of what they send, as much as sinks below the plane of one of their faces is lost
-    in a step, which neither an edge nor a horizon stands for. And for two-sided ones: what sinks below a face gets
-    inside, and out again, by way of edges that are only there for who is inside. That takes large angles, under a sky
-    as well: with more than half of a body of 948 faces bent by 20 degrees, and 29 % by 35, the gain is 0.98 +- 0.03.
+    For meshes that shine or let light through: of what they send, as much as sinks below the plane of one of their
+    faces is lost in a step, which neither an edge nor a horizon stands for. And for two-sided ones: what sinks below a
+    face gets inside, and out again, by way of edges that are only there for who is inside. That takes large angles,
+    under a sky as well: with more than half of a body of 948 faces bent by 20 degrees, and 29 % by 35, the gain is
+    0.98 +- 0.03. Mirrors, whose steps are edges, are right at 30 degrees (1.01 +- 0.01 over a floor under a sky), and
+    a few % off at 55.
 
     Lights, moreover, are sampled with densities per solid angle that have the cosines of their interpolated normals:
     a ball of 8, 12, 16 segments is 2.0, 1.2, 0.2 % too bright. Moved, gains are 1.025, 1.0005 and 1.0002 +- 0.005;

@@ -35,6 +35,7 @@ from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
 from .kind_grid import GridEdges
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
+from .kind_mirror_horizon import MirrorHorizons, lets_through, reflects
 from .kind_rod import RodEdges
 from .kind_shading import ShadingOutlines
 from .kind_tube import TubeOutlines, tube_rows
@@ -215,10 +216,22 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         smooth = [(shape, s) for shape, s in zip(shapes, meshes, strict=True) if s.smooth]
         lights = [shape for shape, s in smooth if s.is_emitter]
         warn_about_coarse(lights, COARSE_LIGHT, job.call.memory, WEIGHTS_OF_LIGHTS)
-        sends = [shape for shape, s in smooth if not s.is_emitter and (s.delta_lobes or flips)]
+        sends = [shape for shape, s in smooth if not s.is_emitter and (lets_through(shape) or flips)]
         warn_about_coarse(sends, limit, job.call.memory)
-        warn_about_coarse([shape for shape, _ in smooth if _lets_light_in(job, shape)], COARSE, job.call.memory)
-    return [ShadingOutlines(faces, centre)]
+        others = [shape for shape, s in smooth if s.delta_lobes or _lets_light_in(job, shape)]
+        warn_about_coarse(others, COARSE, job.call.memory)
+    return [ShadingOutlines(faces, centre), *_mirror_horizons(job, meshes, centre)]
+
+
+def _mirror_horizons(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
+    """Where smooth-shaded meshes begin to reflect under their own faces, as other surfaces see it."""
+    shapes = edge_shapes(job).shapes
+    mirrors = [s for s in meshes if s.smooth and reflects(shapes[s.index])]
+    if job.options.depth_limit < 3 or not mirrors:
+        return []
+    outside = _seen_from_outside(job, mirrors)
+    faces = smooth_faces([shapes[s.index] for s in mirrors], [s.moves for s in mirrors], outside, job.call.memory)
+    return [MirrorHorizons(replace(faces, again=True), centre)]
 
 
 def _lets_light_in(job: Job, mesh: mi.Mesh) -> bool:

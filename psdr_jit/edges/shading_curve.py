@@ -53,11 +53,14 @@ class Face:
         scale = dr.rcp(dr.squared_norm(n))
         return mi.Vector2f(dr.dot(dr.cross(e2, n), v), dr.dot(dr.cross(n, e1), v)) * scale
 
-    def gradient(self, ω: mi.Vector3f) -> mi.Vector3f:
-        """∇h of h = n·ω within the face [1/m]."""
+    def gradient(self, ω: mi.Vector3f, b: mi.Point2f) -> mi.Vector3f:
+        """∇h of h = n·ω within the face [1/m], here the same at every point b."""
+        return self.ascent(dr.dot(self.n[1] - self.n[0], ω), dr.dot(self.n[2] - self.n[0], ω))
+
+    def ascent(self, rise1: mi.Float, rise2: mi.Float) -> mi.Vector3f:
+        """Gradient within the face of what changes by these numbers along its sides."""
         e1, e2 = self.sides
         n = self.n_g
-        rise1, rise2 = dr.dot(self.n[1] - self.n[0], ω), dr.dot(self.n[2] - self.n[0], ω)
         return (rise1 * dr.cross(e2, n) + rise2 * dr.cross(n, e1)) * dr.rcp(dr.squared_norm(n))
 
     @property

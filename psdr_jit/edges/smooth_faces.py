@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..core.compat import mesh_faces
 from ..core.memory import Memory
+from ..core.varying import varying
 from .seams import is_smooth
 from .segments import attached_positions, known_topology
 
@@ -33,6 +34,7 @@ class SmoothFaces:
     rows: FaceRows
     positions: mi.Point3f  # by vertex [m]
     normals: mi.Normal3f  # by vertex, as they are interpolated
+    again: bool = False  # do others ask for the attached normals of the same meshes?
 
     def corners(self, corner: mi.Vector3u, active: mi.Bool) -> tuple[list[mi.Point3f], list[mi.Normal3f]]:
         """Positions [m] and shading normals of the three corners, detached."""
@@ -40,7 +42,10 @@ class SmoothFaces:
 
     def attached_corners(self, corner: mi.Vector3u, active: mi.Bool) -> tuple[list[mi.Point3f], list[mi.Normal3f]]:
         """The same, attached to the meshes' vertices."""
-        return _gathered(attached_positions(self.meshes), _normals(self.meshes), corner, active)
+        normals = _normals(self.meshes)
+        if self.again:  # a product, for the reason given in `attached_positions`
+            normals = mi.Normal3f(normals * varying(mi.Float, 1))
+        return _gathered(attached_positions(self.meshes), normals, corner, active)
 
 
 def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, memory: Memory) -> SmoothFaces | None:

@@ -10,6 +10,7 @@ from ..core.sensor_frame import viewpoint
 from ..edges.coarse import bent_meshes
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.horizons import Horizons, Targets
+from ..edges.kind_mirror_horizon import lets_through, reflects
 from ..edges.kind_shading import ShadingOutlines
 from ..edges.scene_table import scene_edges
 from ..edges.shading_curve import Face
@@ -74,16 +75,25 @@ def horizon_weights(job: Job, term: str, direct: bool) -> list[mi.Float]:
     at_ball = dr.select(straddled, lit / dr.maximum(spread, 1e-6) * angle / near, 0)
     weight *= dr.select(to.radius > 0, at_ball, 1)
     relevant = mi.Bool(True) if _sources_move(job, direct) else rows.moves
-    chosen = dr.gather(mi.UInt32, _flags(bent_meshes(table.faces.meshes, job.call.memory)), rows.shape) != 0
+    chosen = dr.gather(mi.UInt32, _flags(_parted(job, table.faces)), rows.shape) != 0
     return [dr.select(relevant & chosen & dr.isfinite(weight), weight, 0)]
 
 
 def _faces(job: Job) -> SmoothFaces | None:
     """The faces of smooth-shaded meshes, if one of these is coarse."""
     kinds = [kind for kind in scene_edges(job).kinds if isinstance(kind, ShadingOutlines)]
-    if not kinds or not any(bent_meshes(kinds[0].faces.meshes, job.call.memory)):
+    if not kinds or not any(_parted(job, kinds[0].faces)):
         return None
     return kinds[0].faces
+
+
+def _parted(job: Job, faces: SmoothFaces) -> list[bool]:
+    """By mesh: is it coarse, and more than a mirror? What mirrors show steps at edges (`edges.kind_mirror_horizon`)."""
+    others = [
+        lets_through(mesh) or not reflects(mesh) or mi.has_flag(mesh.bsdf().flags(), mi.BSDFFlags.Smooth)
+        for mesh in faces.meshes
+    ]
+    return [bent and other for bent, other in zip(bent_meshes(faces.meshes, job.call.memory), others, strict=True)]
 
 
 def _flags(values: list[bool]) -> mi.UInt32:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 import pytest
 from helpers import adjoint_identity, assert_grad_close, fd, forward
 from test_smooth_meshes import sphere, torus
@@ -85,9 +86,50 @@ def test_a_ball_in_a_mirror(llvm):
     assert_grad_close(forward(moved, spec(3), SEEDS, 512), reference, max_stderr=0.05)
 
 
+def over_a_floor(ball: mi.Mesh) -> mi.Scene:
+    """The camera sees a floor alone, which sees the ball mirror the sky: however fine, dark beside its outline."""
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    camera = {"type": "perspective", "fov": 30, "to_world": look_at([2.2, 0, -0.2], [1, 0, -1.2]), "film": film}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(4)}
+    return scene_of(ball, floor=floor, camera=camera)
+
+
+BRIGHT = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.9}}
+SEEN_BY_A_FLOOR = {
+    "fine": (64, BRIGHT, "move"), "coarse": (8, BRIGHT, "move"), "turned": (12, BRIGHT, "turn"),
+    "plastic": (16, {"type": "plastic", "diffuse_reflectance": 0.0, "int_ior": 2.5}, "move"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SEEN_BY_A_FLOOR)
+def test_a_floor_sees_balls(llvm, case):
+    segments, surface, motion = SEEN_BY_A_FLOOR[case]
+    param, how, step = MOTIONS[motion]
+    moved = perturb(over_a_floor(sphere(segments, bsdf=surface)), param, **how)
+    reference = fd(moved, spec(3), step, SEEDS, 16384)
+    assert_grad_close(forward(moved, spec(3), SEEDS, 1024), reference, max_stderr=0.03)
+
+
+def test_a_floor_sees_as_much_of_a_fine_ball_as_of_a_sphere(llvm):
+    """What the outline hides, the horizon within its rim brings back: without it, 50 of the sum is missing."""
+    integrator = spec(3, sppc=0, sppp=0, sppd=0, spps=0, sppi=1)
+    balls = (sphere(64, bsdf=BRIGHT), "vertex_positions"), ({"type": "sphere", "bsdf": BRIGHT}, "to_world")
+    sums = [forward(perturb(over_a_floor(ball), f"ball.{key}", direction=(1, 0, 0)), integrator, 8, 256).sum((1, 2, 3))
+            for ball, key in balls]  # fmt: skip
+    error = np.hypot(*(s.std(ddof=1) / np.sqrt(len(s)) for s in sums))
+    assert error < 3 and abs(sums[0].mean() - sums[1].mean()) < 5 * error
+
+
 @pytest.mark.parametrize("bsdf", ["mirror", pytest.param("glass", marks=pytest.mark.slow)])
 def test_forward_and_backward_agree(llvm, bsdf):
     surface, depth = BSDFS[bsdf]
     integrator = integrator_specs.build(spec(depth, sppc=0, sppp=16, sppi=0, spps=16))
     wJv, JTwv, w, Jv = adjoint_identity(scene_of(sphere(12, bsdf=surface)), "ball.vertex_positions", integrator)
+    assert Jv > 1e-3 and abs(wJv - JTwv) <= 1e-6 * w * Jv
+
+
+def test_forward_and_backward_agree_on_what_a_floor_sees(llvm):
+    integrator = integrator_specs.build(spec(3, sppc=0, sppp=0, sppd=0, spps=0, sppi=64))
+    wJv, JTwv, w, Jv = adjoint_identity(over_a_floor(sphere(12, bsdf=BRIGHT)), "ball.vertex_positions", integrator)
     assert Jv > 1e-3 and abs(wJv - JTwv) <= 1e-6 * w * Jv

@@ -178,7 +178,7 @@ TWO_SIDED = {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
     (partial(sphere, 16), MIRROR, None), (partial(sphere, 8), LIGHT, 20), (partial(sphere, 24), LIGHT, None),
 ], ids=["light", "mirror", "reflector", "two sides", "fine", "coarse light", "fine light"])  # fmt: skip
 def test_normals_far_off_their_faces_are_named(llvm, mesh, children, named):
-    """Where a face's plane cuts what it mirrors is neither an edge nor a horizon, nor is what gets inside.
+    """What gets inside of a body between its faces comes out by way of neither an edge nor a horizon.
 
     Lights are sampled by their interpolated normals: a ball of eight segments that turns in place had a gain of 0.05.
     """
@@ -191,3 +191,18 @@ def test_normals_far_off_their_faces_are_named(llvm, mesh, children, named):
         make_plan(scene, "shape.vertex_positions", integrator={"type": "psdr_path", "form": "spatial", "sppc": 1})
     degrees = [re.search(r"more than (\d+) degrees off", str(w.message)) for w in caught]
     assert [int(found[1]) for found in degrees if found] == ([] if named is None else [named])
+
+
+@pytest.mark.parametrize("bsdf, named", [({"type": "conductor"}, False), ({"type": "dielectric"}, True)],
+                         ids=["mirror", "glass"])  # fmt: skip
+def test_coarse_mirrors_under_a_sky_are_right(llvm, bsdf, named):
+    """Unlike glass, into which light gets between faces (`test_mirror_rims` has the gain of such a mirror)."""
+    mesh = sphere(8, bsdf=bsdf)
+    mesh.set_id("shape")
+    scene = mi.load_dict(
+        {"type": "scene", "shape": mesh, "sky": {"type": "constant"}, "camera": {"type": "perspective"}}
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make_plan(scene, "shape.vertex_positions", integrator={"type": "psdr_path", "max_depth": 3, "sppc": 1})
+    assert any("degrees off" in str(w.message) for w in caught) == named

@@ -19,6 +19,7 @@ from psdr_jit.edges.kind_ellipsoid import EllipsoidOutlines
 from psdr_jit.edges.kind_grid import GridEdges
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
+from psdr_jit.edges.kind_mirror_horizon import MirrorHorizons
 from psdr_jit.edges.kind_pattern import AnalyticPatterns, MeshPatterns
 from psdr_jit.edges.kind_rod import RodEdges
 from psdr_jit.edges.kind_shading import ShadingOutlines
@@ -32,11 +33,23 @@ RADIUS, DISTANCE = 0.6, 4.0
 SHIFT = (0.48, 0.6, 0.64)
 PLACED = ("vertex_positions", "to_world", "control_points", "data")
 STRIDES = {"control_points": 4, "data": 10}
+
+
+def mirror_ball() -> mi.Scene:
+    """A smooth-shaded ball that mirrors a sky."""
+    mesh = scene_io.shipped_scene("smooth_mesh.xml").parent / "meshes" / "smooth_sphere.obj"
+    ball = {"type": "obj", "filename": str(mesh), "bsdf": {"type": "conductor"}}
+    pose = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": pose}
+    return mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant"}, "sensor": sensor}, optimize=False)
+
+
 PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
     AnalyticCurves: ("ball_shadow", ["blocker.to_world"]),
     ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
+    MirrorHorizons: (mirror_ball, ["ball.vertex_positions"]),
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
     TubePatterns: ("painted_curves", ["spline.control_points"]),
@@ -61,7 +74,10 @@ def test_every_kind_is_looked_at():
 def found(request, llvm):
     """`(job, kind)`: a kind of edge in a scene where something moves."""
     name, moving = PLACES[request.param]
-    scene = scene_io.load_scene(scene_io.shipped_scene(f"{name}.xml"), res=16)
+    if callable(name):
+        scene = name()
+    else:
+        scene = scene_io.load_scene(scene_io.shipped_scene(f"{name}.xml"), res=16)
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 3, "form": "spatial", "sppc": 1})
     with also_enabled(scene, [name for name in moving if name in set(mi.traverse(scene).keys())]):
         job = prepare(integrator.call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]

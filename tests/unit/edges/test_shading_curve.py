@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from psdr_jit.edges.kind_mirror_horizon import MirroredFace
 from psdr_jit.edges.shading_curve import Face, curve_on, may_cross
 
 FACES, SAMPLES = 32, 4096
@@ -68,12 +69,34 @@ def test_a_sphere_is_seen_up_to_its_horizon(llvm):
     assert np.allclose(np.array(dr.dot(x, mi.Vector3f(3, 0.1, 0.2))), np.array(dr.squared_norm(x)), atol=1e-5)
 
 
-def test_the_gradient_is_that_of_the_height(llvm):
-    face = random_face(np.random.default_rng(5), 1.0)
-    ω, b, step = mi.Vector3f(0.36, -0.48, 0.8), mi.Point2f(0.2, 0.5), 1e-2
+def rise(face: Face, ω: mi.Vector3f, b: mi.Point2f, along: mi.Vector3f) -> mi.Float:
+    """Change of n·ω along a vector in the face, by central differences."""
+    step = 1e-2 * mi.Point2f(face.barycentric(along))
+    return dr.dot(face.normal(b + step) - face.normal(b - step), ω) / 2e-2
+
+
+@pytest.mark.parametrize("kind", [Face, MirroredFace])
+def test_the_gradient_is_that_of_the_height(llvm, kind):
+    plain = random_face(np.random.default_rng(5), 1.0)
+    face = kind(plain.p, plain.n)
+    ω, b = mi.Vector3f(0.36, -0.48, 0.8), mi.Point2f(0.2, 0.5)
     along = face.sides[0] * 0.3 + face.sides[1] * 0.7
-    change = dr.dot(face.normal(b + mi.Point2f(step * face.barycentric(along))) - face.normal(b), ω) / step
-    assert np.allclose(np.array(dr.dot(face.gradient(ω), along)), np.array(change), rtol=1e-3)
+    assert np.allclose(np.array(dr.dot(face.gradient(ω, b), along)), np.array(rise(face, ω, b, along)), rtol=1e-3)
+
+
+def test_its_norm_is_that_of_all_components(llvm):
+    face, b = random_face(np.random.default_rng(5), 1.0), mi.Point2f(0.2, 0.5)
     axes = [mi.Vector3f(*row) for row in np.eye(3).tolist()]
-    total = np.sqrt(sum(np.array(dr.squared_norm(face.gradient(axis))) for axis in axes))
+    total = np.sqrt(sum(np.array(dr.squared_norm(face.gradient(axis, b))) for axis in axes))
     assert np.allclose(np.array(face.gradient_norm), total, rtol=1e-5)
+
+
+def test_horizons_are_where_mirrors_reflect_along_the_face(llvm):
+    face = random_face(np.random.default_rng(7), 0.5)
+    b, n = mi.Point2f(0.3, 0.4), dr.normalize(face.n_g)
+    M, n_s = MirroredFace(face.p, face.n).normal(b), dr.normalize(face.normal(b))
+    for u in np.linspace(0, 1, 7).tolist():
+        sin, cos = dr.sincos(mi.Float(2 * np.pi * u))
+        s, t = mi.coordinate_system(dr.normalize(M))
+        ω = cos * s + sin * t
+        assert abs(float(dr.dot(n, ω - 2 * dr.dot(n_s, ω) * n_s)[0])) < 1e-5
