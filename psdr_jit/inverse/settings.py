@@ -21,7 +21,7 @@ class Settings:
     iterations: int = 100
     spp: int = 16  # of the image that the loss sees
     gradient_spp: int = 0  # of the derivative; 0: as many
-    control_variate: bool = False  # images carry along what earlier iterations know of them, see `control_variate`
+    control_variate: bool = False  # images carry along what earlier iterations know, see `inverse.control_variate`
     views_per_step: int = 0  # views that are rendered per iteration; 0: all
     seed: int = 0
     decay: float = 1.0  # of the learning rates, from the first to the last iteration, geometrically

@@ -117,6 +117,7 @@ def test_an_iteration_that_failed_can_be_repeated(llvm):
     assert np.all(again.arrays()["0/0/image"] == np.array(found)) and again.arrays().keys() == estimates.arrays().keys()
 
 
+@pytest.mark.filterwarnings("ignore::psdr_jit.errors.ZeroDerivativeWarning")  # only images are looked at
 def test_images_of_a_run_have_less_noise(llvm):
     """A box creeps along: what the loss sees then, beside single images."""
     problem = problem_of(Pose(BOX, 0.02, start_shift=(0.2, 0, -0.1)), spp=4)
