@@ -9,7 +9,7 @@ import io
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,15 @@ class Checkpoint:
     best: Mapping[str, np.ndarray]  # latents of the best state
     history: Mapping[str, np.ndarray]  # losses, see `History.arrays`, and means of the targets
     seconds: float
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)  # carried along, see `control_variate`
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write beside `path`, flush to the disk, then replace. Raises `CheckpointError`; the old file is then intact."""
     header = {"format": FORMAT, "iteration": checkpoint.iteration, "fingerprint": checkpoint.fingerprint,
               "seconds": checkpoint.seconds}  # fmt: skip
-    parts = {"now": checkpoint.arrays, "best": checkpoint.best, "history": checkpoint.history}
+    parts = {"now": checkpoint.arrays, "best": checkpoint.best, "history": checkpoint.history,
+             "images": checkpoint.images}  # fmt: skip
     named = {f"{part}/{key}": value for part, found in parts.items() for key, value in found.items()}
     content = io.BytesIO()
     np.savez(content, header=json.dumps(header), **named)
@@ -79,6 +81,7 @@ def load(path: Path, fingerprint: str) -> Checkpoint:
         _below("best/", arrays),
         _below("history/", arrays),
         header["seconds"],
+        _below("images/", arrays),
     )
 
 

@@ -17,6 +17,7 @@ from psdr_jit.errors import CheckpointError, ClusterError, OptionError, StalledW
 from psdr_jit.inverse import checkpoint as checkpoints
 from psdr_jit.inverse import lock, show
 from psdr_jit.inverse.checkpoint import Checkpoint
+from psdr_jit.inverse.control_variate import Single, estimates_of
 from psdr_jit.inverse.divergence import Watch
 from psdr_jit.inverse.history import History
 from psdr_jit.inverse.interruption import interruptible
@@ -61,6 +62,7 @@ class _State:
     latents: Latents
     optimisers: dict[str, Any]  # by parameter
     history: History
+    estimates: Single  # of the images that the loss sees
     iteration: int = 0
     seconds: float = 0.0  # of runs before this one
     lost: dict[str, int] = field(default_factory=dict)  # iterations in a row without a usable gradient, by latent
@@ -224,7 +226,7 @@ def begin(problem: Problem) -> _State:
             opt[latent] = value
             latents[name][latent] = opt[latent]
         checkpoints.make_opaque(opt)  # counters start as literals: the first step would have kernels of its own
-    return _State(latents, optimisers, history)
+    return _State(latents, optimisers, history, estimates_of(problem.settings.control_variate))
 
 
 def _restore(problem: Problem, state: _State, stored: Checkpoint) -> None:
@@ -238,20 +240,22 @@ def _restore(problem: Problem, state: _State, stored: Checkpoint) -> None:
             best[name][latent] = like(dr.detach(latents[latent]), stored.best[f"{name}/{latent}"])
     state.iteration, state.seconds = stored.iteration, stored.seconds
     state.history.restore(stored.history, best)
+    state.estimates.restore(stored.images)
 
 
 def _checkpoint(problem: Problem, state: _State) -> Checkpoint:
     best = {f"{name}/{latent}": numbers(v) for name, of in state.history.best.items() for latent, v in of.items()}
     history = {**state.history.arrays(), "targets": problem.target_means}
-    arrays = checkpoints.optimiser_arrays(state.optimisers)
-    return Checkpoint(state.iteration, problem.fingerprint, arrays, best, history, state.clock())
+    arrays, images = checkpoints.optimiser_arrays(state.optimisers), state.estimates.arrays()
+    return Checkpoint(state.iteration, problem.fingerprint, arrays, best, history, state.clock(), images)
 
 
 def _iterate(problem: Problem, state: _State, journal: Journal) -> float:
     """One step of every optimiser, from where the scene stands; the loss before it."""
     start = time.perf_counter()
     before = copied(state.latents)
-    loss, images = problem.evaluate(state.iteration)
+    loss, images = problem.evaluate(state.iteration, state.estimates)
+    state.estimates.settle()
     state.history.add(loss, before)
     rate = problem.rate(state.iteration)
     state.norms = {}

@@ -16,6 +16,7 @@ from psdr_jit.core.film import require_samples
 from psdr_jit.core.upload import in_memory
 from psdr_jit.derivative.integrator_specs import aovs_of
 from psdr_jit.errors import OptionError, ParameterError
+from psdr_jit.inverse.control_variate import Single
 from psdr_jit.inverse.losses import Loss, find_loss
 from psdr_jit.inverse.parts import Part, Stage, begun, parts_of
 from psdr_jit.inverse.settings import Settings
@@ -114,20 +115,23 @@ class Problem:
         """Of a view's loss in that of an iteration which sees the `chosen` ones; right on average over these."""
         return self.views[view].share * len(self.views) / len(chosen)
 
-    def evaluate(self, iteration: int) -> tuple[float, dict[int, np.ndarray]]:
+    def evaluate(self, iteration: int, estimates: Single | None = None) -> tuple[float, dict[int, np.ndarray]]:
         """Loss of the views of an iteration; its gradient is added to that of the scene's parameters.
+
+        `estimates`: how the images are found that the loss sees; unless given, each is rendered by itself.
 
         All views see one state of the scenes. Their gradients meet in the parameters, and only then go on to the
         latents: else the first view would use up the graph between them. A loss that is not finite, or whose
         derivative by the image is not, ends this with NaN and leaves the rest undone.
         """
+        estimates = estimates or Single()
         if self.crew is not None:
-            return self.crew.evaluate(self, iteration)
+            return self.crew.evaluate(self, iteration, estimates)
         total, images = 0.0, {}
         chosen = self.chosen(iteration)
         with dr.isolate_grad():
             for k in chosen:
-                loss, image, grad = self._view(iteration, k)
+                loss, image, grad = self._view(iteration, k, estimates)
                 images[k] = image
                 if not (np.isfinite(loss) and dr.all(dr.isfinite(grad), axis=None)):
                     return float("nan"), images
@@ -139,16 +143,21 @@ class Problem:
                 )  # fmt: skip
         return total, images
 
-    def _view(self, iteration: int, k: int) -> tuple[float, np.ndarray, mi.TensorXf]:
+    def _view(self, iteration: int, k: int, estimates: Single) -> tuple[float, np.ndarray, mi.TensorXf]:
         """Loss of one view, its image, and the derivative of the loss by the image."""
-        images, part = [], self.parts[self.views[k].part]
-        with dr.suspend_grad():
-            for purpose in IMAGES[: self.loss.images]:
-                image = part.integrator.render(part.scene, self.views[k].sensor, seed=self.seed(iteration, k, purpose),
-                                               spp=self.settings.spp)  # fmt: skip
-                images.append(mi.TensorXf(dr.detach(image)))
+        images = []
+        for purpose in IMAGES[: self.loss.images]:
+            seeds = estimates.seeds(self.seed, iteration, (k, purpose))
+            images.append(estimates.estimate((k, purpose), [self._image(k, seed) for seed in seeds]))
         loss, grad = self.loss_of(k, images)
         return loss, np.array(dr.detach(images[0])), grad
+
+    def _image(self, k: int, seed: int) -> mi.TensorXf:
+        """One view, rendered, detached."""
+        part = self.parts[self.views[k].part]
+        with dr.suspend_grad():
+            image = part.integrator.render(part.scene, self.views[k].sensor, seed=seed, spp=self.settings.spp)
+            return mi.TensorXf(dr.detach(image))
 
     def loss_of(self, k: int, images: list[mi.TensorXf]) -> tuple[float, mi.TensorXf]:
         """Loss of one view that looks like `images`, and its derivative by these, added up."""

@@ -23,6 +23,7 @@ from psdr_jit.derivative.make_plan import make_plan
 from psdr_jit.derivative.remote import Spec, integrator_of, sensor_index
 from psdr_jit.derivative.sampler import TOTAL
 from psdr_jit.errors import OptionError
+from psdr_jit.inverse.control_variate import Single
 from psdr_jit.inverse.problem import GRADIENT, IMAGES, Problem
 from psdr_jit.scene.names import traverse
 from psdr_jit.scene.params import is_transform
@@ -101,12 +102,12 @@ class Crew:
             raise OptionError("workers make integrators of their own: give its properties as a dict, or its name")
         self._hands = [_Hands(client, problem, k, integrator) for k in range(len(problem.parts))]
 
-    def evaluate(self, problem: Problem, iteration: int) -> tuple[float, dict[int, np.ndarray]]:
+    def evaluate(self, problem: Problem, iteration: int, estimates: Single) -> tuple[float, dict[int, np.ndarray]]:
         """See `Problem.evaluate`."""
         chosen = problem.chosen(iteration)
         for hands in self._hands:
             hands.update()
-        images = self._images(problem, iteration, chosen)
+        images = self._images(problem, iteration, chosen, estimates)
         total, units = 0.0, []
         for k in chosen:
             loss, grad = problem.loss_of(k, images[k])
@@ -129,15 +130,21 @@ class Crew:
     def _of(self, problem: Problem, view: int) -> _Hands:
         return self._hands[problem.views[view].part]
 
-    def _images(self, problem: Problem, iteration: int, chosen: Sequence[int]) -> dict[int, list[mi.TensorXf]]:
+    def _images(self, problem: Problem, iteration: int, chosen: Sequence[int],
+                estimates: Single) -> dict[int, list[mi.TensorXf]]:
         """Images by view, as many as the loss wants to see."""
-        purposes, units = IMAGES[: problem.loss.images], []
-        for k in chosen:
+        keys = [(k, purpose) for k in chosen for purpose in IMAGES[: problem.loss.images]]
+        seeds = {key: estimates.seeds(problem.seed, iteration, key) for key in keys}
+        units = []
+        for k, purpose in keys:
             hands = self._of(problem, k)
-            views = [(hands.sensors[k], problem.settings.spp, problem.seed(iteration, k, p)) for p in purposes]
+            views = [(hands.sensors[k], problem.settings.spp, seed) for seed in seeds[k, purpose]]
             units += [(hands.engine, (hands.spec, view)) for view in views]
-        found = together(image_unit, units)
-        return {k: [mi.TensorXf(np.array(next(found))) for _ in purposes] for k in chosen}
+        found, images = together(image_unit, units), {k: [] for k in chosen}
+        for key in keys:
+            rendered = [mi.TensorXf(np.array(next(found))) for _ in seeds[key]]
+            images[key[0]].append(estimates.estimate(key, rendered))
+        return images
 
 
 def _go_on(value: Any, grad: np.ndarray) -> None:

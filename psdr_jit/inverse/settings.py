@@ -21,6 +21,7 @@ class Settings:
     iterations: int = 100
     spp: int = 16  # of the image that the loss sees
     gradient_spp: int = 0  # of the derivative; 0: as many
+    control_variate: bool = False  # images carry along what earlier iterations know, see `inverse.control_variate`
     views_per_step: int = 0  # views that are rendered per iteration; 0: all
     seed: int = 0
     decay: float = 1.0  # of the learning rates, from the first to the last iteration, geometrically
@@ -38,6 +39,8 @@ class Settings:
         given = {name: getattr(self, name) for name in least}
         bad = [name for name, value in given.items() if not _is_whole(value) or value < least[name]]
         wrong = [f"{name} = {given[name]!r}: expected a whole number from {least[name]} on" for name in bad]
+        if not isinstance(self.control_variate, bool):
+            wrong.append(f"control_variate = {self.control_variate!r}: expected true or false")
         if self.perturb is not None and not (_is_whole(self.perturb) and self.perturb >= 0):
             wrong.append(f"perturb = {self.perturb!r}: expected a whole number from 0 on")
         if not (is_number(self.decay) and 0 < self.decay <= 1):

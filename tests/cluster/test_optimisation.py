@@ -73,8 +73,10 @@ def assert_same(a: Any, b: Any, tolerance: float = ROUNDING) -> None:
             assert b.offsets[name][kind] == pytest.approx(value, rel=tolerance)
 
 
-def test_two_workers_step_as_this_process_does(two):
-    assert_same(shadow_box(), shadow_box(**by(two)))
+@pytest.mark.parametrize("control_variate", [False, True])
+def test_two_workers_step_as_this_process_does(two, control_variate):
+    how = {"control_variate": control_variate}
+    assert_same(shadow_box(**how), shadow_box(**how, **by(two)))
 
 
 def test_views_are_added_up_and_poses_of_cameras_follow(two):

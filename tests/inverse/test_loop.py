@@ -145,8 +145,8 @@ class OnlyView:
     def evaluate(self, iteration):
         return type(self._problem).evaluate(self, iteration)
 
-    def _view(self, iteration, k):
-        return type(self._problem)._view(self._problem, iteration, k)
+    def _view(self, *which):
+        return type(self._problem)._view(self._problem, *which)
 
     def chosen(self, iteration):
         return [self._k]
