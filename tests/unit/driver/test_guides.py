@@ -130,7 +130,7 @@ def slowly(name: str):
 @pytest.mark.parametrize("name", ["area_shadow", slowly("baffled_light"), slowly("environment_shadow")])
 def test_a_guide_for_something_else_is_no_bias(llvm, name):
     """Only noise may tell: 0, -g and g/2 would be rejected."""
-    seeds = 24
+    seeds = 12
     (a, δa), (b, δb) = (mean_and_error(name, guide, seeds) for guide in (None, made_for_something_else()))
     blocks_a, blocks_b = (x.reshape(4, 2, 4, 2, 3).mean((1, 3, 4)) for x in (a, b))
     error = np.sqrt((δa**2 + δb**2).reshape(4, 2, 4, 2, 3).sum((1, 3, 4))) / 12
