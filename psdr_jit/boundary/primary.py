@@ -44,7 +44,6 @@ from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.distribution import stratified
 from ..sampling.rows import ROW_SAMPLER, RowSampler, edge_samples, row_state
 from ..scene.facts import SceneFacts
-from .mirror_rims import has_rims, look_beyond
 
 NAME = "primary"
 
@@ -161,8 +160,6 @@ def trace_sides(job: Job, edges: PrimaryEdges, sample: EdgeSample):
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
-    if has_rims(job.facts):
-        pi = look_beyond(seen, ray, pi)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
         ray, pi = skip_emitters(job.scene, ray, pi)
