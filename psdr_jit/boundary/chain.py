@@ -11,8 +11,8 @@ with radiances L that are traced with common random numbers, times the throughpu
 would make 1/F_X blow up: with lines in both directions and the weights F_x²/(F_x² + F_y²) and F_y²/(F_x² + F_y²) what
 is left is −F_θ F_X/(F_x² + F_y²). F_x, F_y and F_θ are derivatives of one attached path (`chain_sweeps`); the sensor
 is attached as well. No virtual camera, no root search, no count of solutions: as the path begins at the film, all of
-that is settled by tracing it. Steps of the first segment belong to `primary`, and paths that leave their first vertex
-by a smooth lobe to the other terms.
+that is settled by tracing it. Steps of the first segment belong to `primary`, and so do horizons of mirrors that end
+it (`edges.kind_mirror_horizon`); paths that leave their first vertex by a smooth lobe belong to the other terms.
 
 Behind the first vertex any segment may step: what a mirror shows, the shadow on it (a shadow ray towards a point of
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
@@ -45,14 +45,13 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_chain
-from .chain_crossing import adjoint_of_speed, beside_curve, crossings, step_per_slope
+from .chain_crossing import adjoint_of_speed, beside_curve, crossings, sampled_as_edge, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
 from .chain_outline import Curve
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
 from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
-from .mirror_rims import has_rims, is_counted
 
 NAME = "chain"
 
@@ -152,8 +151,8 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
 
     p = line.at(found.at.lo)
     valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
-    if has_rims(job.facts):
-        valid &= is_counted(lines, pair, line, curve.line)
+    if lines.world.surfaces.horizons:
+        valid &= ~sampled_as_edge(pair, curve.line)
     per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.ad import backpropagate, tangents
+from ..core.records import Hit
 from .chain_outline import Curve, beside_cut, beside_line, crossed_curve
 from .chain_sweeps import AtRest, slope_at_end
 from .chain_trace import ChainRecords, Pair
@@ -39,6 +40,16 @@ def beside_curve(lines: SearchedLines, pair: Pair, curve: Curve) -> Pair:
     if lines.world.patterns is not None:
         pair = beside_line(lines.job.scene, pair, curve)
     return beside_cut(lines.job.scene, pair, curve)
+
+
+def sampled_as_edge(pair: Pair, sight: Hit) -> mi.Bool:
+    """Is the crossing left to `primary`? Horizons that the camera sees are if a mirror reflects along its face there
+    (`edges.kind_mirror_horizon`), or if they lie on an edge. `sight`: the segment that meets the crossed curve.
+    """
+    seen = pair.horizon & (pair.sight == 0)
+    si = sight.intersection().compute_surface_interaction(mi.Ray3f(sight.o, sight.d), mi.RayFlags.All, seen)
+    reflected = dr.dot(si.sh_frame.n, pair.a.d) * dr.dot(si.sh_frame.n, sight.d) < 0
+    return seen & (reflected | ~pair.one_face)
 
 
 def step_per_slope(lines: SearchedLines, chain: ChainRecords, end, at: tuple, first: Callable):

@@ -44,7 +44,6 @@ from ..sampling.film_edges import FilmEdges, film_edges, film_weights
 from ..sampling.guided import guided
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
-from .mirror_rims import has_rims, look_beyond
 
 NAME = "primary"
 
@@ -136,8 +135,6 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
-    if has_rims(job.facts):
-        pi = look_beyond(seen, ray, pi)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
         ray, pi = skip_emitters(job.scene, ray, pi)

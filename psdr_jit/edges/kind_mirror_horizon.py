@@ -12,8 +12,14 @@ the face: with N_i = ∂N/∂b_i
     ∂h/∂b_i = 2 (N·N_i) (n·ω) − 2 (n·N_i) (N·ω) − 2 (n·N) (N_i·ω).
 
 However fine the mesh, a grazing mirror reflects all light: the step does not go away, as that of a smooth lobe does.
-From the sensor's viewpoint no parametrisation of the curve is at hand: what it sees of these curves is found by lines
-across the film (`boundary/chain_search`), and lines through them are for what other surfaces see.
+
+*From a viewpoint* o the curve is met, as in `kind_shading`, on the way x = A + r (E(s) − A) from a corner to a point of
+the opposite side, where
+
+    h |x − o| = |N|² n·(x − o) − 2 (n·N) N·(x − o) = Σ_k g_k r^k
+
+is a cubic in r, as n·(x − o) is the same all over the face. Between the places where its slope is 0 it has one root at
+most, which is found by halving.
 """
 
 from __future__ import annotations
@@ -23,10 +29,20 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame
+from ..core.sensor_frame import SensorFrame, viewpoint
+from .film_cover import LENS_CENTRE, curve_cover
 from .kind import OnEdge, Use
 from .kind_within_faces import CurvesWithinFaces
-from .shading_curve import Face
+from .shading_curve import ALTERNATIONS, CurvePoint, Face
+
+#: Halvings of an interval in r: as far as float32 tells its ends apart.
+HALVINGS = 24
+
+#: What rounding adds to the height above a face at which horizons may be seen, as a factor.
+ROUNDED = 1.001
+
+#: Corners in barycentric coordinates.
+CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 
 
 def reflects(mesh: mi.Mesh) -> bool:
@@ -56,6 +72,88 @@ class MirroredFace(Face):
             rises.append(2 * turned)
         return self.ascent(*rises)
 
+    def tilt(self, b: tuple[float, float]) -> mi.Float:
+        """Sine of the angle between M and the face's normal: in other directions no mirror reflects along the face."""
+        M, n = self.normal(mi.Point2f(b)), dr.normalize(self.n_g)
+        return dr.norm(dr.cross(n, M)) / dr.norm(M)
+
+    def may_cross(self, view: mi.Vector4f, slack: mi.Float) -> mi.Bool:
+        """False where no point of the face reflects along it from any viewpoint within `slack` of `view` [m].
+
+        No interpolated normal is farther off the face than that of a corner, by α, so that |n·ω| ≤ sin 2α.
+        """
+        n, eye = dr.normalize(self.n_g), mi.Vector3f(view.x, view.y, view.z)
+        steep, far = mi.Float(0), mi.Float(0)
+        for p, n_s in zip(self.p, self.n, strict=True):
+            cos = dr.abs(dr.dot(n, n_s)) / dr.norm(n_s)
+            steep = dr.maximum(steep, dr.select(dr.square(cos) > 0.5, 2 * cos * dr.safe_sqrt(1 - dr.square(cos)), 1))
+            far = dr.maximum(far, dr.norm(view.w * mi.Vector3f(p) - eye))
+        height = dr.abs(dr.dot(n, view.w * mi.Vector3f(self.p[0]) - eye))
+        return height <= ROUNDED * steep * (far + slack) + slack
+
+    def curve(self, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
+        """The curve on the way from a corner, the one that is alone on its side of it, to the point s of its side.
+
+        Where that way crosses the curve more than once, the points take turns, of many small intervals of s each.
+        """
+        eye, w, n = mi.Vector3f(view.x, view.y, view.z), view.w, dr.normalize(self.n_g)
+        D = [w * mi.Vector3f(p) - eye for p in self.p]
+        N = [mi.Vector3f(corner) for corner in self.n]
+        c = dr.dot(n, D[0])
+        up = [dr.squared_norm(N[k]) * c > 2 * dr.dot(n, N[k]) * dr.dot(N[k], D[k]) for k in range(3)]
+        alone = [(up[k] != up[(k + 1) % 3]) & (up[k] != up[(k + 2) % 3]) for k in range(3)]
+
+        def turned(values: list, k: int):
+            """Entry k after the lone corner."""
+            first, second = values[(1 + k) % 3], values[(2 + k) % 3]
+            return dr.select(alone[1], first, dr.select(alone[2], second, values[k % 3]))
+
+        D, N, p = ([mi.Vector3f(turned(v, k)) for k in range(3)] for v in (D, N, self.p))
+        across, along = p[2] - p[1], p[1] + s * (p[2] - p[1]) - p[0]
+        N0, N1, D0, D1 = N[0], N[1] + s * (N[2] - N[1]) - N[0], D[0], w * along
+        z = dr.dot(N0, D0), dr.dot(N0, D1) + dr.dot(N1, D0), dr.dot(N1, D1)
+        q = dr.squared_norm(N0), 2 * dr.dot(N0, N1), dr.squared_norm(N1)
+        p0, p1 = dr.dot(n, N0), dr.dot(n, N1)
+        g = (c * q[0] - 2 * p0 * z[0], c * q[1] - 2 * (p0 * z[1] + p1 * z[0]),
+             c * q[2] - 2 * (p0 * z[2] + p1 * z[1]), -2 * p1 * z[2])  # fmt: skip
+        r, count = _root(g, s)
+        towards = D0 + r * D1
+        slope = dr.abs(g[1] + r * (2 * g[2] + 3 * r * g[3]))
+        weights = [1 - r, r * (1 - s), r * s]  # of the corners, the lone one first
+        b1 = dr.select(alone[1], weights[0], dr.select(alone[2], weights[2], weights[1]))
+        b2 = dr.select(alone[1], weights[1], dr.select(alone[2], weights[0], weights[2]))
+        distance = dr.norm(towards)
+        weight = count * dr.norm(dr.cross(r * across, along)) * distance / slope
+        return CurvePoint(mi.Point2f(b1, b2), towards / distance, weight, (count > 0) & (slope > 0))
+
+
+def _root(g: tuple, s: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """One of the roots in (0, 1) of the cubic Σ g_k r^k, and how many there are; s: by which they take turns."""
+
+    def at(r: mi.Float) -> mi.Float:
+        return g[0] + r * (g[1] + r * (g[2] + r * g[3]))
+
+    # where the slope g1 + 2 g2 r + 3 g3 r² is 0
+    k = -(g[2] + dr.select(g[2] < 0, -1.0, 1.0) * dr.safe_sqrt(dr.square(g[2]) - 3 * g[1] * g[3]))
+    bends = [dr.select(dr.isfinite(e) & (e > 0) & (e < 1), e, 1) for e in (k / (3 * g[3]), g[1] / k)]
+    ends = [mi.Float(0), dr.minimum(*bends), dr.maximum(*bends), mi.Float(1)]
+    high = [at(end) > 0 for end in ends]
+    crosses = [high[i] != high[i + 1] for i in range(3)]
+    count = sum(dr.select(there, mi.Float(1), 0) for there in crosses)
+    turn = s * ALTERNATIONS
+    left = dr.floor((turn - dr.floor(turn)) * count)
+    lo, hi, rises = mi.Float(0), mi.Float(1), mi.Bool(True)
+    for i, there in enumerate(crosses):
+        taken = there & (left == 0)
+        lo, hi = dr.select(taken, ends[i], lo), dr.select(taken, ends[i + 1], hi)
+        rises = dr.select(taken, high[i + 1], rises)
+        left -= dr.select(there, mi.Float(1), 0)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (lo + hi)
+        before = (at(middle) > 0) != rises
+        lo, hi = dr.select(before, middle, lo), dr.select(before, hi, middle)
+    return 0.5 * (lo + hi), count
+
 
 class MirrorHorizons(CurvesWithinFaces):
     """Where n is the face's normal as the mirror shows it."""
@@ -64,7 +162,16 @@ class MirrorHorizons(CurvesWithinFaces):
         return MirroredFace(p, n)
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
-        return dr.zeros(mi.Float, self.count)
+        """Length of the curve on the film; where only a part of it, or of the lens, sees one, that of the face."""
+        rows, face = self.faces.rows, self.all_faces()
+        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
+        slack = frame.aperture if frame.kind == "thinlens" else mi.Float(0)
+        ends = [face.curve(mi.Float(s), eye) for s in (0.0, 1.0)]
+        found = ends[0].valid & ends[1].valid
+        length = curve_cover(frame, border, face.p, tuple(face.at(end.b) for end in ends), found)
+        front = rows.shell * dr.dot(face.n_g, mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(face.p[0]))
+        hidden = (rows.shell != 0) & (front <= -slack * dr.norm(face.n_g))
+        return dr.select(face.may_cross(eye, slack) & ~hidden, length, 0)
 
     def line_weights(self, use: Use) -> mi.Float:
         """As of shading outlines, but that M turns twice as fast, and that the face is seen at the angle of M to its
@@ -72,18 +179,14 @@ class MirrorHorizons(CurvesWithinFaces):
         """
         if use is not Use.STEP:
             return dr.zeros(mi.Float, self.count)
-        face, tilt = self.all_faces(), mi.Float(0)
-        n = dr.normalize(face.n_g)
-        for b in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-            M = face.normal(mi.Point2f(b))
-            tilt += dr.norm(dr.cross(n, M)) / dr.norm(M) / 3
+        face = self.all_faces()
+        tilt = sum(face.tilt(b) for b in CORNERS) / 3
         bend = 2 * face.gradient_norm * dr.sqrt(0.5) / dr.norm(face.n[0] + face.n[1] + face.n[2]) * 3
         weight = face.area * bend * tilt * dr.select(self.faces.rows.shell != 0, 0.5, 1) * dr.pi
         return dr.select(dr.isfinite(weight), weight, 0)
 
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
-        """None: see above."""
         rows, face = self.face(row, active)
-        eye = mi.Vector3f(view.x, view.y, view.z)
-        ω = dr.normalize(view.w * mi.Vector3f(face.p[0]) - eye)
-        return self.point(face, mi.Point2f(1 / 3), ω, face.area, mi.Bool(False))
+        curve = face.curve(t, view)
+        seen = dr.dot(face.n_g, curve.ω) * rows.shell <= 0  # a closed surface is seen from outside
+        return self.point(face, curve.b, curve.ω, curve.weight, active & curve.valid & seen)

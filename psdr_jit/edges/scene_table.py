@@ -224,10 +224,10 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
 
 
 def _mirror_horizons(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
-    """Where smooth-shaded meshes begin to reflect under their own faces, as other surfaces see it."""
+    """Where smooth-shaded meshes begin to reflect under their own faces."""
     shapes = edge_shapes(job).shapes
     mirrors = [s for s in meshes if s.smooth and reflects(shapes[s.index])]
-    if job.options.depth_limit < 3 or not mirrors:
+    if job.options.depth_limit < 2 or not mirrors:
         return []
     outside = _seen_from_outside(job, mirrors)
     faces = smooth_faces([shapes[s.index] for s in mirrors], [s.moves for s in mirrors], outside, job.call.memory)

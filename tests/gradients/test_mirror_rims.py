@@ -44,17 +44,24 @@ def spec(depth: int, **budgets) -> dict:
     return {"type": "psdr_path", "max_depth": depth, "rr_depth": 1000, **budgets}
 
 
-def check(ball: mi.Mesh, depth: int, motion: str, reference_spp: int) -> None:
+def check(ball: mi.Mesh, depth: int, motion: str, reference_spp: int, spp: int = 256) -> None:
     param, how, step = MOTIONS[motion]
     moved = perturb(scene_of(ball), param, **how)
     reference = fd(moved, spec(depth), step, SEEDS, reference_spp)
-    assert_grad_close(forward(moved, spec(depth), SEEDS, 256), reference, max_stderr=0.05)
+    assert_grad_close(forward(moved, spec(depth), SEEDS, spp), reference, max_stderr=0.05)
 
 
 def test_a_ball_that_mirrors_a_sky(llvm):
     """All that can be seen to move are outlines and rims; inside of the ball it is dark."""
     surface, depth = BSDFS["mirror"]
     check(sphere(12, bsdf=surface), depth, "move", 1024)
+
+
+def test_rims_of_a_fine_ball(llvm):
+    """All of its steps are edges, however narrow: without horizons among them the gain is 2."""
+    moved = perturb(scene_of(sphere(64, bsdf=MIRROR)), "ball.vertex_positions", direction=SHIFT)
+    reference = fd(moved, spec(2), STEP, SEEDS, 512)
+    assert_grad_close(forward(moved, spec(2, sppc=0, sppp=1, spps=0), 8, 64), reference, max_stderr=0.03)
 
 
 # What turning in place changes is small: of plastic, 3 % of it is missing, by what is thin for a pixel.
@@ -66,7 +73,7 @@ CASES = [(bsdf, motion) for bsdf in BSDFS for motion in MOTIONS if (bsdf, motion
 @pytest.mark.parametrize("bsdf, motion", CASES)
 def test_a_ball_under_a_sky(llvm, bsdf, motion, segments):
     surface, depth = BSDFS[bsdf]
-    check(sphere(segments, bsdf=surface), depth, motion, 8192)
+    check(sphere(segments, bsdf=surface), depth, motion, 8192, 1024 if bsdf == "glass" else 256)
 
 
 @pytest.mark.slow
@@ -82,7 +89,8 @@ def test_a_ball_in_a_mirror(llvm):
     mirror = {"type": "rectangle", "bsdf": {"type": "conductor"},
               "to_world": look_at([0, 2.5, 0], [0, -4, 0.5]).scale(4)}  # fmt: skip
     moved = perturb(scene_of(sphere(12, bsdf=MIRROR), mirror=mirror), "ball.vertex_positions", direction=SHIFT)
-    reference = fd(moved, spec(3), STEP, SEEDS, 16384)
+    # with STEP, differences are 0.3 % further off than with half of it, which is more than their noise
+    reference = fd(moved, spec(3), STEP / 4, SEEDS, 16384)
     assert_grad_close(forward(moved, spec(3), SEEDS, 512), reference, max_stderr=0.05)
 
 
