@@ -75,6 +75,14 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             memory,
         )
     for lamp, other in contacts.lamps:
+        if other.bsdf() is not None and mi.has_flag(other.bsdf().flags(), mi.BSDFFlags.Null):
+            warn_once(
+                f"the area light '{shown_name(lamp)}' cuts into '{shown_name(other)}', behind which it is seen: where "
+                "the camera sees it on both sides, a part of the derivative is missing (a quarter for a ball of light "
+                "half below a pane, as the field of view changes); keep them apart by a hundredth of their size",
+                UnsupportedWarning,
+                memory,
+            )
         if job.form == "spatial" and not shaded_smooth(lamp, memory):
             continue
         cure = "keep them apart by a hundredth of their size"

@@ -158,7 +158,8 @@ SUPPORT = (
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
     Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
-        "the curve where they meet, also of parts of one mesh; smooth-shaded lights that touch others: warning"),
+        "the curve where they meet, also of parts of one mesh; smooth-shaded lights that touch others, lights in "
+        "windows or masks: warning"),
     Row("cylinders, disks, spheres, curves, SDF grids and ellipsoids that cut into other shapes", "warning",
         "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),

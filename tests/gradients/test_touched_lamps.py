@@ -120,3 +120,17 @@ def test_the_plan_says_so_and_material_form_warns(mono):
     with pytest.warns(UnsupportedWarning, match="'lamp' touches 'floor'"):
         image = forward(motion, {"type": "psdr_path", "max_depth": 2, "form": "material"}, 1, 4)
     assert np.isfinite(image).all()
+
+
+def test_a_lamp_in_a_window_is_named(mono):
+    """What is seen of it behind the window, while what is above is seen beside, is not whole."""
+    bright = {"sky": {"type": "constant", "radiance": 0.7}}
+    for floor, named in (({"type": "thindielectric"}, True), ({"type": "diffuse"}, False)):
+        scene = sunk(**bright, floor={
+            "type": "rectangle", "bsdf": floor,
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(3),
+        })  # fmt: skip
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            psdr_jit.make_plan(scene, ["camera.to_world"], integrator={"type": "psdr_path", "max_depth": 2})
+        assert any("cuts into 'floor', behind which it is seen" in str(w.message) for w in said) == named
