@@ -95,7 +95,7 @@ class LineTally:
         """
         tree = grown(*self.sums())
         gain = (1 - EVEN_SHARE) / tree.left
-        return (LineGuide.of(tree), gain) if gain >= least_gain else (LineGuide.of(UNDIVIDED), 1.0)
+        return (LineGuide.of(tree), gain) if gain >= least_gain else (NO_PREFERENCE, 1.0)
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,9 @@ def _with_even_share(tree: Tree) -> np.ndarray:
     lower = np.full(len(tree.axis), 0.5)
     lower[inner] = mixed[2 * np.arange(len(inner)) + 1] / mixed[inner]
     return lower
+
+
+NO_PREFERENCE = LineGuide.of(UNDIVIDED)
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..core.line_guide import Drawn, GuideTables, LineGuide, evenly
+from ..core.line_guide import NO_PREFERENCE, Drawn, GuideTables, LineGuide
 from ..core.memory import Slot
 from ..plan.job import Job
 from .distribution import stratified
@@ -17,10 +17,8 @@ def guided(job: Job, count: int, jitter: mi.Float, u: mi.Point2f) -> tuple[mi.Fl
     """`(x, u, drawn)`: `count` stratified numbers x for edges, u for directions; densities are to be multiplied by
     `drawn.p`.
     """
-    x = stratified(count, jitter)
-    if job.guide is None:
-        return x, u, evenly(x, u)
+    guide = job.guide or NO_PREFERENCE  # in the same kernels
     tables = job.shared[GUIDES]
-    if job.guide not in tables:
-        tables[job.guide] = job.guide.tables()
-    return tables[job.guide].draw(x, u)
+    if guide not in tables:
+        tables[guide] = guide.tables()
+    return tables[guide].draw(stratified(count, jitter), u)
