@@ -73,7 +73,7 @@ def grown(fine: np.ndarray, broad: np.ndarray) -> Tree:
     """The tree for Σw and Σw² of two halves of the samples, (2, 2, X, U, V), in cells of `FINE` and of `BROAD`."""
     levels, planes = [], []
     here = None
-    for k in range(int(FINE[0]).bit_length() - 1, -1, -1):
+    for k in range(_finest(broad), -1, -1):
         below = here
         plane = _planes(_at(k, fine, broad))
         top = plane[-1].nodes
@@ -85,6 +85,13 @@ def grown(fine: np.ndarray, broad: np.ndarray) -> Tree:
         levels.append(_Step(here, 0, divided, lower))
         planes.append(plane)
     return _collected(levels[::-1], planes[::-1])
+
+
+def _finest(broad: np.ndarray) -> int:
+    """Halvings of x: as many as there are for one effective sample in each interval."""
+    w, squares = broad.sum((1, 2, 3, 4))
+    n = w**2 / squares if squares > 0 else 1.0
+    return min(FINE[0].bit_length() - 1, max(0, int(np.log2(max(n, 1.0)))))
 
 
 def _at(k: int, fine: np.ndarray, broad: np.ndarray) -> np.ndarray:
