@@ -28,7 +28,6 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
-from ..core.varying import varying
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
@@ -105,10 +104,9 @@ def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_EDGE), lane)
     jitter = rng.next_1d()
     x, u, drawn = guided(job, count, jitter, rng.next_2d())
-    row, t = edges.rows.sample(edges.state, x)
+    row, t, pdf = edges.rows_at(x, count)
     aperture = u if job.frame.kind == "thinlens" else mi.Point2f(0.5)
-    pdf = edges.rows.pdf(edges.state, row, t) * (varying(mi.Float, count) * drawn.p)
-    sample = EdgeSample(row, t, aperture, pdf, lane, drawn)
+    sample = EdgeSample(row, t, aperture, pdf * drawn.p, lane, drawn)
 
     seen = seen_edge(job, edges, sample)
     view, p = seen.view, seen.view.p

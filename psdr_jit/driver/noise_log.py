@@ -97,5 +97,5 @@ class NoiseLog:
         for (form, name, n), seen in over_film.items():
             self.current = self.current.seen_on_film(form, name, sum(seen) / len(seen), n, len(seen))
         self.pending.clear()
-        if self.guides_due:
-            self.current = self.current.guided(FADED)
+        if self.guides_due and self.share is not None:
+            self.current = self.current.guided(self.share[1][0], FADED)

@@ -116,14 +116,15 @@ class Measurement:
         terms = {**self.noise[form], name: replace(term, film=term.film.seen(variance, n, calls))}
         return Measurement({**self.noise, form: terms})
 
-    def guided(self, fade: float) -> Measurement:
-        """With guides made anew; what they were made of counts for the share `fade` of itself from now on."""
-        noise = {form: {name: term.guided() for name, term in terms.items()} for form, terms in self.noise.items()}
-        for terms in noise.values():
-            for term in terms.values():
-                if term.heard is not None:
-                    term.heard.fade(fade)
-        return Measurement(noise)
+    def guided(self, form: str, fade: float) -> Measurement:
+        """With guides of `form`, the one that runs, made anew; what they were made of counts for the share `fade` of
+        itself from now on.
+        """
+        terms = {name: term.guided() for name, term in self.noise[form].items()}
+        for term in terms.values():
+            if term.heard is not None:
+                term.heard.fade(fade)
+        return Measurement({**self.noise, form: terms})
 
     def allocate(self, form: str, spp: Mapping[str, int], names: Iterable[str]) -> dict[str, int]:
         """Paths per pixel by term, with the least variance at the cost of `spp`; only those of `names` change."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,16 +11,14 @@ import mitsuba as mi
 from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable
 from ..plan.job import Job
-from .rows import ROW_SAMPLER, RowSampler, row_state
+from .rows import ROW_SAMPLER, SampledRows, row_state
 
 
 @dataclass(frozen=True)
-class FilmEdges:
-    """What can be seen to move, and how its rows are drawn."""
+class FilmEdges(SampledRows):
+    """What can be seen to move."""
 
     table: EdgeTable
-    rows: RowSampler
-    state: Any  # of `rows`
 
 
 def film_weights(job: Job) -> list[mi.Float]:
