@@ -25,8 +25,10 @@ from benchmarks.distances import chamfer
 from benchmarks.inverse_pictures import write_section
 from benchmarks.inverse_tables import CAMERA_PATHS, OURS, OVERHEAD, PEER
 from benchmarks.suites import Settings
+from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import PsdrError
 from psdr_jit.inverse import config, loop
+from psdr_jit.inverse.targets import rendered
 
 NAME = "inverse"
 BUDGET = 600.0  # [s] longest run
@@ -75,6 +77,16 @@ def distance_to_knob(problem: Any, latents: Any) -> float:
     return chamfer((positions.reshape(-1, 3), faces), other)
 
 
+def caustic_error(problem: Any, latents: Any) -> float:
+    """Root mean square of what the image with its caustics, which few integrators show, lacks of the target."""
+    problem.apply(latents)
+    spec = {"type": "psdr_bdpt", "max_depth": integrator_specs.path_options(problem.integrator)["max_depth"]}
+    seen = problem.views[0]
+    image = rendered(problem.scene, seen.sensor, integrator_specs.build(spec), CAUSTIC_SPP)
+    return float(np.sqrt(np.mean((image - np.array(seen.target)) ** 2)))
+
+
+CAUSTIC_SPP = 2048  # of its picture, whose noise is far below what counts as solved
 CAMERA, LAMP, BLOCKER = "camera.to_world", "lamp.position", "blocker.vertex_positions"
 BOX, BALL, IOR = "box.vertex_positions", "ball.to_world", "ball.bsdf.eta"
 CAMERA_SIZE = 4.3  # [units] from the camera to the middle of the boxes
@@ -114,6 +126,12 @@ EXAMPLES = {
         named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
         {"ior": below(0.01), "spot": below(0.01)},
     ),
+    "smooth_caustic": Example(
+        "smooth_caustic",
+        named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
+        {"ior": below(0.01), "spot": below(0.01)},
+    ),
+    "lens": Example("lens", named(caustic=caustic_error), {"caustic": tenth}),
     "lamps": Example(
         "lamps",
         named(distance=offset(BLOCKER, "distance", SHADOW_SIZE), angle_degrees=offset(BLOCKER, "angle_degrees"),

@@ -83,6 +83,12 @@ BULGES = (  # direction, height, width
     ((1, 0.6, 0.3), 0.35, 0.2), ((-0.7, 0.8, -0.4), 0.25, 0.15), ((0, -0.9, 0.6), 0.3, 0.25),
 )  # fmt: skip
 
+PANE_POINTS = 33  # along a side, from -1 to 1
+SMILE = (  # x, z, depth and width of bumps that gather light: two eyes, and a mouth along an arc
+    *((x, -0.35, 0.006, 0.14) for x in (-0.35, 0.35)),
+    *((0.55 * np.cos(t), 0.55 * np.sin(t) - 0.05, 0.0035, 0.09) for t in np.linspace(0.15 * np.pi, 0.85 * np.pi, 9)),
+)
+
 
 class Space:
     """The parts accepted so far; tells whether another one has room."""
@@ -348,6 +354,23 @@ def knob() -> tuple[np.ndarray, np.ndarray]:
     return (KNOB_RADIUS * (1 - WAIST * np.exp(-((d[:, 1] / 0.3) ** 2)) + bulges))[:, None] * d, faces
 
 
+def pane() -> tuple[np.ndarray, np.ndarray]:
+    """The lower side of a pane: a square sheet across y, normals down."""
+    x, z = np.meshgrid(*[np.linspace(-1, 1, PANE_POINTS)] * 2, indexing="ij")
+    i = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]
+    faces = np.concatenate([np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))])
+    return np.stack([x, 0 * x, z], axis=-1).reshape(-1, 3), faces
+
+
+def smile() -> tuple[np.ndarray, np.ndarray]:
+    """A pane with bumps, under which parallel light draws a face."""
+    positions, faces = pane()
+    x, _, z = positions.T
+    positions[:, 1] = -sum(h * np.exp(-((x - cx) ** 2 + (z - cz) ** 2) / (2 * w * w)) for cx, cz, h, w in SMILE)
+    return positions, faces
+
+
 def write_ply(path: Path, positions: np.ndarray, faces: np.ndarray) -> None:
     """Binary PLY: float32 positions, and triangles of int32 indices."""
     header = (
@@ -381,7 +404,8 @@ def write_ellipsoids(path: Path, rows: np.ndarray) -> None:
 
 
 def main() -> None:
-    makers = {"branching": branching, "occluders": occluders, "extruded": extruded, "ball": ball, "knob": knob}
+    makers = {"branching": branching, "occluders": occluders, "extruded": extruded, "ball": ball, "knob": knob,
+              "pane": pane, "smile": smile}  # fmt: skip
     for name, make in makers.items():
         write_ply(MESHES / f"{name}.ply", *make())
     write_vol(MESHES / "torus.vol", torus_values())

@@ -87,6 +87,7 @@ class Config:
     variables: tuple[Any, ...]
     settings: Settings
     scenes: tuple[SceneTable, ...] = ()  # if there are several; `scene` is the first then
+    shown_by: str = integrator_specs.DEFAULT_INTEGRATOR  # whose images rendered targets are
 
 
 def read(path: str | Path, **changes: Any) -> Config:
@@ -144,8 +145,10 @@ def _checked(path: Path, content: Mapping[str, Any], wrong: list[str]) -> Config
     except OptionError as error:
         wrong += str(error).split("; ")
         return None
+    own = integrator["type"] in integrator_specs.OURS  # they show light that `path` does not
+    shown_by = integrator["type"] if own else integrator_specs.DEFAULT_INTEGRATOR
     return Config(path, scene, loss, tables["defaults"], integrator, tuple(targets), tuple(variables), settings,
-                  scenes)  # fmt: skip
+                  scenes, shown_by)  # fmt: skip
 
 
 def _table(content: Mapping[str, Any], name: str, wrong: list[str]) -> Mapping[str, Any]:
@@ -264,8 +267,7 @@ def _stage(config: Config, k: int, table: SceneTable, send: bool) -> Stage:
     scene = scene_io.load_scene(table.file, **table.defaults)
     integrator_specs.build(integrator_specs.integrator_spec(scene, config.integrator))  # raises before rendering
     kept = {key: value for key, value in config.integrator.items() if key in (*integrator_specs.PATH_OPTIONS, "aovs")}
-    spec = integrator_specs.integrator_spec(scene, kept | {"type": integrator_specs.DEFAULT_INTEGRATOR})
-    path = integrator_specs.build(spec)
+    shown_by = integrator_specs.build(integrator_specs.integrator_spec(scene, kept | {"type": config.shown_by}))
     targets: dict[int, Any] = {}
     for target in (target for target in config.targets if target["stage"] == k):
         source = scene
@@ -275,12 +277,13 @@ def _stage(config: Config, k: int, table: SceneTable, send: bool) -> Stage:
         for sensor in target["sensor"]:
             if sensor in targets:
                 raise OptionError(f"'{config.path}': sensor {sensor} has two targets")
-            targets[sensor] = target["file"] if "file" in target else rendered(source, sensor, path, target["render"])
+            spp = target.get("render")
+            targets[sensor] = rendered(source, sensor, shown_by, spp) if spp else target["file"]
     source = SceneFile(str(table.file), dict(table.defaults), send)
     return Stage(scene, targets, table.weight, table.name, source)
 
 
 def with_integrator(config: Config, plugin: str) -> Config:
-    """The same with another integrator, which keeps the path lengths of the first."""
+    """The same with another integrator, which keeps the path lengths of the first; targets stay what they are."""
     kept = {key: config.integrator[key] for key in integrator_specs.PATH_OPTIONS if key in config.integrator}
     return replace(config, integrator={"type": plugin, **kept})

@@ -34,13 +34,16 @@ class Vertices:
     λ = `smoothness` and L the mesh's Laplacian (`mi.ad.LargeSteps`, which needs the package `cholespy`);
     `smoothness = 0` steps the positions themselves. `learning_rate` is in scene units.
     `spread`: a perturbed start is stretched along every axis by up to this factor and shifted by up to this share of
-    its size.
+    its size, and displaced by `spread_bumps` [scene units, rms], smooth as steps are, each vertex at random.
+    `axes`: along which vertices move, such as "xyz"; a sheet across y that moves along "y" alone is a height field.
     """
 
     parameter: str
     learning_rate: float
     smoothness: float = 19.0
     spread: float = 0.0
+    spread_bumps: float = 0.0
+    axes: str = AXES
     uniform: bool = True
     _own: np.ndarray = field(default=None, init=False, repr=False)
     _steps: Any = field(default=None, init=False, repr=False)
@@ -53,6 +56,8 @@ class Vertices:
         positions = _positions(scene, self.parameter, params)
         if not self.smoothness >= 0:
             raise OptionError(f"'{self.parameter}': smoothness = {self.smoothness} must not be negative")
+        if not self.axes or not set(self.axes) <= set(AXES) or len(set(self.axes)) < len(self.axes):
+            raise OptionError(f"'{self.parameter}': axes = {self.axes!r}: expected letters out of xyz, each once")
         self._own = numbers(positions)
         if self.smoothness > 0:
             faces = mi.UInt32(params[self.parameter[: -len(VERTEX_POSITIONS)] + "faces"])
@@ -77,10 +82,22 @@ class Vertices:
         centre, size = (p.max(0) + p.min(0)) / 2, np.ptp(p, axis=0).max()
         moved = centre + (p - centre) * (1 + self.spread * rng.uniform(-1, 1, 3))
         moved += self.spread * size * rng.uniform(-1, 1, 3) / 2
-        return {"u": self._latent(uploaded(mi.Float, moved.astype(np.float32)))}
+        if self.spread_bumps > 0:
+            bumps = numbers(self._positions(uploaded(mi.Float, rng.normal(size=p.size).astype(np.float32))))
+            moved += (bumps * (self.spread_bumps / rms(bumps))).reshape(-1, 3)
+        free = [axis in self.axes for axis in AXES]
+        return {"u": self._latent(uploaded(mi.Float, np.where(free, moved, p).astype(np.float32)))}
 
     def value(self, latents: Mapping[str, Any]) -> Any:
-        return latents["u"] if self._steps is None else self._steps.from_differential(latents["u"])
+        found = self._positions(latents["u"])
+        if set(self.axes) == set(AXES):
+            return found
+        axis = dr.arange(mi.UInt32, dr.width(found)) % len(AXES)
+        free = dr.gather(mi.Bool, mi.Bool([name in self.axes for name in AXES]), axis)
+        return dr.select(free, found, uploaded(mi.Float, self._own.astype(np.float32)))
+
+    def _positions(self, u: mi.Float) -> mi.Float:
+        return u if self._steps is None else self._steps.from_differential(u)
 
     def constrained(self, latents: dict[str, Any]) -> dict[str, Any]:
         return latents

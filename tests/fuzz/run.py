@@ -1,6 +1,6 @@
-"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [specular]`.
+"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [specular|bidirectional]`.
 
-`specular`: with mirrors, glass, plastic, windows and masks.
+`specular`: with mirrors, glass, plastic, windows and masks; `bidirectional`: these by `psdr_bdpt`.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import sys
 
 import mitsuba as mi
 from fuzz.scenes import case_of
-from fuzz.specular import specular_case_of
+from fuzz.specular import bidirectional_case_of, specular_case_of
 from fuzz.verdict import VARIANT, examine
 
 import psdr_jit  # noqa: F401  (registers the plugins)
 
-KINDS = {"": case_of, "specular": specular_case_of}
+KINDS = {"": case_of, "specular": specular_case_of, "bidirectional": bidirectional_case_of}
 
 
 def main(first: int, count: int, kind: str = "") -> None:

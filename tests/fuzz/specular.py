@@ -12,6 +12,7 @@ from fuzz.scenes import SOLID, Case, case_of, lift
 SALT = 0x61A55  # keeps these streams apart from others with the same seeds
 SHARE = 0.6  # of the objects; of each scene, one at least
 FLOOR_SHARE = 0.3
+NOT_SHOWN = "but not what mirrors and smooth glass show of it"  # in the warning about light of points
 
 
 def specular_case_of(seed: int) -> Case:
@@ -32,6 +33,17 @@ def specular_case_of(seed: int) -> Case:
         "form": draw.one(["spatial", "auto"]),
         "max_depth": draw.weighted({2: 2, 3: 4, 4: 3, 5: 1}),
     }
+    return case
+
+
+def bidirectional_case_of(seed: int) -> Case:
+    """The same by `psdr_bdpt`, which wants a smooth filter for the light of points by way of mirrors and glass."""
+    case = specular_case_of(seed)
+    case["integrator"] |= {"type": "psdr_bdpt"}
+    case["accepted"] = [NOT_SHOWN]  # by the image as well, of which differences are taken
+    film = case["scene"]["camera"]["film"]
+    if film["rfilter"]["type"] == "box":
+        film["rfilter"] = {"type": "gaussian"}
     return case
 
 

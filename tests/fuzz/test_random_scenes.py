@@ -13,7 +13,7 @@ from fuzz import verdict
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
-from fuzz.specular import specular_case_of
+from fuzz.specular import bidirectional_case_of, specular_case_of
 from fuzz.verdict import RIGHT, VARIANT, WRONG, Effort, Look, Outcome, examine
 from variants import activate
 
@@ -39,7 +39,8 @@ def mono() -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
-@pytest.mark.parametrize("draw", [case_of, specular_case_of], ids=["smooth", "specular"])
+@pytest.mark.parametrize("draw", [case_of, specular_case_of, bidirectional_case_of],
+                         ids=["smooth", "specular", "bidirectional"])
 def test_a_random_scene(mono, draw, seed):
     case = draw(seed)
     outcome = examine(case)
