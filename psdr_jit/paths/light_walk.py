@@ -236,11 +236,11 @@ def _follow(
         found.own = dr.select(seen_by_sensor(scene, si, view, hide_emitters, found.own > 0), found.own, 0)
         kept = kept.offered(found, sampler.next_1d())
 
-        onward = bounce(si, bsdf, sampler, path, own, ctx, active & (~first | focuses(bsdf)))
+        onward = bounce(si, bsdf, sampler, path, own, ctx, active & (~first | _begins(bsdf, delta_light)))
         delta = onward.scattering.delta
         if vertices is not None:
             vertices.write(path.k, si, pi, delta, active)
-        alive = onward.alive & (s < technique.longest)
+        alive = onward.alive & (s < technique.longest) & (~first | delta | focuses(bsdf))
         turn = _turn(technique, onward.scattering, si, bsdf, limits, alive)
         step = turn.step / onward.scattering.pdf
         p = dr.select(first, _root(delta_light, turn.p, dr.select(delta, 0, pdf_em)), turn.p)
@@ -261,6 +261,13 @@ def _follow(
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         active &= pi.is_valid()
     return kept.standing_for_all()
+
+
+def _begins(bsdf: mi.BSDFPtr, delta_light: mi.Bool) -> mi.Bool:
+    """Does light go on from its first surface? That of points from all that mirror, plastic as well."""
+    flags = bsdf.flags()
+    mirrors = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    return focuses(bsdf) | (delta_light & mirrors)
 
 
 def _turn(technique: LightTechnique, s: Scattering, si, bsdf: mi.BSDFPtr, limits: PathLimits, active) -> _Turn:

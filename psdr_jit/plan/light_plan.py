@@ -80,9 +80,19 @@ def narrow_shapes(facts: SceneFacts) -> list[int]:
 
 
 def focusing_shapes(scene: mi.Scene, facts: SceneFacts) -> list[int]:
-    """Those of them that may gather light on others, and that one can aim at."""
+    """Those of them that may gather light on others, and that one can aim at.
+
+    What mirrors make of the light of points is found in no other way: where there are some, every mirror counts.
+    """
     sizes = {k: scene.shapes()[k].bbox().extents() for k in narrow_shapes(facts)}
-    return [k for k, size in sizes.items() if math.hypot(*size) < SPANS * facts.extent]
+    bodies = [k for k, size in sizes.items() if math.hypot(*size) < SPANS * facts.extent]
+    points = any(light.delta and light.plugin in TRACED for light in facts.emitters)
+    return sorted({*bodies, *(s.index for s in _mirrors(facts) if s.index >= 0)}) if points else bodies
+
+
+def _mirrors(facts: SceneFacts) -> list[ShapeFacts]:
+    """Shapes that mirror or bend light without scattering it."""
+    return [s for s in facts.shapes if any("Null" not in lobe for lobe in s.delta_lobes)]
 
 
 def plan_light(
@@ -99,7 +109,7 @@ def plan_light(
     targets = focusing_shapes(scene, facts)
     _warn_about_unseen_light(facts, targets, memory)
     for obstacle, reason in (
-        (not narrow_shapes(facts), "no surface is glass or a mirror, nothing is focused"),
+        (not narrow_shapes(facts) and not targets, "no surface is glass or a mirror, nothing is focused"),
         (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)}"),
         (not targets, "glass and mirrors span the scene, there is nothing to aim at"),
         (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
@@ -146,15 +156,15 @@ def _only_lights_change(facts: SceneFacts) -> bool:
 
 def _warn_about_unseen_light(facts: SceneFacts, targets: list[int], memory: Memory | None) -> None:
     """A point's light by way of a mirror or smooth glass: from the camera's side nothing finds it."""
-    mirrors = [s for s in facts.shapes if any("Null" not in lobe for lobe in s.delta_lobes)]
+    mirrors = _mirrors(facts)
     points = [e for e in facts.emitters if e.delta]
     if not (points and mirrors):
         return
     far = [e for e in points if e.plugin not in TRACED]
-    large = [s for s in mirrors if s.index not in targets]
-    shown = f"light of {_listed(far or points)} that {_listed(large or mirrors)} mirrors or bends onto other surfaces"
-    if far or large:
-        why = f"light subpaths start from {', '.join(TRACED)} lights and are aimed at bodies smaller than the scene"
+    beside = [s for s in mirrors if s.index not in targets]
+    shown = f"light of {_listed(far or points)} that {_listed(beside or mirrors)} mirrors or bends onto other surfaces"
+    if far or beside:
+        why = f"light subpaths start from {', '.join(TRACED)} lights and are aimed at shapes that are no instances"
         message = f"{shown} is not in the image, as in Mitsuba's path: {why}; make the light an area light"
     else:
         message = f"{shown} is in the image, but not what mirrors and smooth glass show of it, as in Mitsuba's path"
