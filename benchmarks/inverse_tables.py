@@ -12,7 +12,8 @@ OVERHEAD = "overhead: "  # begins the names of cases that take the time of an it
 
 UNITS = {"angle_degrees": "angle [degrees]", "rms": "RMS displacement", "chamfer": "Chamfer distance",
          "distance": "distance / size", "lamp": "lamp: distance / size", "blocker": "box: distance / size",
-         "ior": "refractive index", "spot": "spot: distance / size", "caustic": "RMS of the caustic's image", "left": "left lamp: relative brightness",
+         "ior": "refractive index", "spot": "spot: distance / size", "caustic": "RMS of the caustic's image",
+         "left": "left lamp: relative brightness",
          "right": "right lamp: relative brightness"}  # fmt: skip
 
 

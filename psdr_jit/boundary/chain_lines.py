@@ -36,6 +36,7 @@ class Line:
     horizontal: mi.Bool
     aperture: mi.Point2f
     wavelength: mi.Float  # random number
+    lobe: mi.Float  # another one
 
     def at(self, s: mi.Float) -> mi.Point2f:
         """Film position [px] a share `s` of the way along."""
@@ -70,7 +71,8 @@ class Lines(SearchedLines):
         horizontal, offset = u.x < 0.5, u.y
         aperture, wavelength = rng.next_2d(), rng.next_1d()
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
-        return Line(start, horizontal, aperture, wavelength)
+        lobe = dr.select(horizontal, 2 * u.x, 2 * u.x - 1)  # well spread among the lines of either direction
+        return Line(start, horizontal, aperture, wavelength, lobe)
 
     def per_pixel(self, sample: mi.UInt32) -> mi.Float:
         """Expected number of lines of one direction across the pixel of a line."""

@@ -4,6 +4,10 @@ Of two delta lobes each is chosen as often as the BSDF would where the vertex is
 may then change along the line, its random number being the same; that is no step of what is seen: with probability p(x)
 of a lobe at the place x, a crossing there brings 1/p(x) of what it does by that lobe, and is met with probability p(x).
 The search finds such places as it does crossings (`chain_search`), and leaves them.
+
+One number chooses at vertex after vertex: what it is within the interval of the lobe that it chose is uniform again
+(`LobeNumber`). So a chain of lobes with probability P has one interval of length P, of which well spread numbers meet
+the right share; by numbers of their own, of 8 lines across a ball of glass 7 ± 1 would pass straight through.
 """
 
 from __future__ import annotations
@@ -17,11 +21,38 @@ from ..paths.bounce import particle_eval
 from ..paths.delta_step import FIRST_LOBE, LAST_LOBE
 from .chain_fixed import Direction
 
-#: Least probability of either of two delta lobes.
-LEAST_LOBE = 0.1
+#: Least probability of either of two delta lobes. Where lamps are mirrored in glass more would be better (.1: a sixth
+#: less noise), where pictures are seen through it less (.1: half as much noise again, and more).
+LEAST_LOBE = 0.04
+
+#: Length of the interval within which a lobe number is drawn anew: its last digits are spent.
+SPENT = 2.0**-6
+
+ALMOST_ONE = 1 - 2.0**-24  # rounding must not lead out of [0, 1)
 
 #: Share of the chains that go on by a smooth lobe where a surface has both kinds.
 SMOOTH_SHARE = 0.5
+
+
+@dataclass
+class LobeNumber:
+    """What is left of a random number that chose lobes, and the length of the interval that it was in."""
+
+    u: mi.Float
+    length: mi.Float
+
+    @staticmethod
+    def begin(u: mi.Float) -> LobeNumber:
+        return LobeNumber(mi.Float(u), mi.Float(1))
+
+    def or_fresh(self, u: mi.Float) -> LobeNumber:
+        """This, or another one where it is spent."""
+        return dr.select(self.length < SPENT, LobeNumber(u, mi.Float(1)), self)
+
+    def behind(self, onward: Leaving, active: mi.Bool) -> LobeNumber:
+        """What is left once it chose `onward`."""
+        left = LobeNumber(onward.rest, self.length * onward.probability)
+        return dr.select(active & onward.by_delta, left, self)
 
 
 @dataclass
@@ -33,6 +64,8 @@ class Leaving:
     alive: mi.Bool
     by_delta: mi.Bool
     through: mi.Bool  # by the one that leads through the surface
+    probability: mi.Float  # with which one of two was chosen, else 1
+    rest: mi.Float  # the number that chose, within the interval of what it chose: uniform again
 
 
 def has_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
@@ -73,7 +106,7 @@ def leave(
     ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
     factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
     alive = (smooth & dr.any(factor != 0)) | onward.alive
-    return Leaving(ray, factor, alive, onward.alive, onward.through)
+    return Leaving(ray, factor, alive, onward.alive, onward.through, onward.probability, onward.rest)
 
 
 def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
@@ -102,4 +135,6 @@ def _delta_leave(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, u: mi.Float, 
     probability = dr.select(two & (bs.pdf < 1), LEAST_LOBE + (1 - 2 * LEAST_LOBE) * bs.pdf, 1)
     alive = there & dr.any(value != 0)
     ray = si.spawn_ray(si.to_world(bs.wo))
-    return Leaving(ray, dr.select(alive, value / probability, 0), alive, alive, through)
+    factor = dr.select(alive, value / probability, 0)
+    rest = dr.clip((u - dr.select(through, 1 - probability, 0)) / probability, 0, ALMOST_ONE)
+    return Leaving(ray, factor, alive, alive, through, probability, rest)

@@ -25,7 +25,7 @@ from ..scene.registry import registry_table
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps
-from .chain_lobes import Leaving, has_delta, leave, smooth_choice
+from .chain_lobes import Leaving, LobeNumber, has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_surface import NOWHERE, ChainSurfaces, goes_under
 
@@ -164,9 +164,10 @@ class Numbers:
 
 
 @dr.syntax
-def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: Directions):
-    """Follow a chain of every line and draw the directions that it keeps. `rng` as for `trace_pair`. Fills `out`."""
+def guide(world: ChainWorld, ray: mi.Ray3f, numbers: tuple, sampler, line: mi.UInt32, out: Directions):
+    """Follow a chain of every line and draw the directions that it keeps. `numbers` as for `trace_pair`. Fills `out`."""
     ray, k, active = mi.Ray3f(ray), mi.UInt32(0), mi.Bool(True)
+    rng, lobe = numbers[0], LobeNumber.begin(numbers[1])
     ctx = mi.BSDFContext(world.mode)
     while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out, ctx]):
         si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
@@ -175,7 +176,9 @@ def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: 
         smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
         fixed = draw_direction(si, sampler, smooth & active, world.aims)
         out.write(k, line, fixed)
-        onward = leave(si, k, u.lobe, fixed, active, ctx)
+        lobe = lobe.or_fresh(u.lobe.y)
+        onward = leave(si, k, mi.Point2f(u.lobe.x, lobe.u), fixed, active, ctx)
+        lobe = lobe.behind(onward, active)
         ray, active = onward.ray, onward.alive
         k += 1
 
@@ -184,14 +187,16 @@ def guide(world: ChainWorld, ray: mi.Ray3f, rng, sampler, line: mi.UInt32, out: 
 def trace_pair(
     world: ChainWorld,
     rays: tuple[mi.Ray3f, mi.Ray3f],
-    rng,
+    numbers: tuple,
     fixed: tuple[Directions, mi.UInt32],
     store: ChainRecords | None,
 ):
     """Follow two chains as long as they meet the same surfaces; `store` keeps the segments of the first.
 
-    `fixed`: the directions of all lines, and the number of this one.
+    `numbers`: a sampler, and the random number that chooses delta lobes, the same for all chains of a line. `fixed`:
+    the directions of all lines, and the number of this one.
     """
+    rng, lobe_a, lobe_b = numbers[0], LobeNumber.begin(numbers[1]), LobeNumber.begin(numbers[1])
     ray_a, ray_b = mi.Ray3f(rays[0]), mi.Ray3f(rays[1])
     (directions, line), ctx = fixed, mi.BSDFContext(world.mode)
     active, pair = mi.Bool(True), Pair.start()
@@ -225,8 +230,10 @@ def trace_pair(
             pair = world.connects(world, pair, (a, b), u, active & (pair.k > 0))
             active &= ~pair.differs
             direction = directions.read(pair.k, line, active)
-        on_a = leave(a, pair.k, u.lobe, direction, active, ctx)
-        on_b = leave(b, pair.k, u.lobe, direction, active, ctx)
+        lobe_a, lobe_b = lobe_a.or_fresh(u.lobe.y), lobe_b.or_fresh(u.lobe.y)
+        on_a = leave(a, pair.k, mi.Point2f(u.lobe.x, lobe_a.u), direction, active, ctx)
+        on_b = leave(b, pair.k, mi.Point2f(u.lobe.x, lobe_b.u), direction, active, ctx)
+        lobe_a, lobe_b = lobe_a.behind(on_a, active), lobe_b.behind(on_b, active)
         pair.chosen = on_a.by_delta & on_b.by_delta & (on_a.through != on_b.through)
         pair.differs |= pair.chosen
         if dr.hint(store is not None, mode="scalar"):

@@ -71,6 +71,7 @@ class LightLine:
     start: mi.Point2f  # [cells]
     horizontal: mi.Bool
     wavelength: mi.Float  # random number
+    lobe: mi.Float  # another one
 
     def at(self, s: mi.Float) -> mi.Point2f:
         """Position [cells] a share `s` of the way along."""
@@ -185,11 +186,14 @@ class LightLines(SearchedLines):
         for i, ball in enumerate(self._targets):
             seen = self._bundle(light, place, ball, far)
             y, axis, density = (dr.select(target == i, *v) for v in zip(seen, (y, axis, density), strict=True))
-        horizontal, offset, wavelength = rng.next_1d() < 0.5, rng.next_1d(), rng.next_1d()
+        way, offset, wavelength = rng.next_1d(), rng.next_1d(), rng.next_1d()
+        horizontal = way < 0.5
+        lobe = dr.select(horizontal, 2 * way, 2 * way - 1)
         corner = mi.Point2f(mi.Float(cell % CELLS), mi.Float(cell // CELLS))
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
         side = 2 / CELLS * dr.rsqrt(dr.pi * density)  # R² = Ω/π
-        return LightLine(emitter, far, y, axis, density, side, cell_of_all, across, start, horizontal, wavelength)
+        return LightLine(emitter, far, y, axis, density, side, cell_of_all, across, start, horizontal, wavelength,
+                         lobe)  # fmt: skip
 
     def _bundle(
         self, light: mi.EmitterPtr, place: mi.Point3f, ball: Ball, far: mi.Bool

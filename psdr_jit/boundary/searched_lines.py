@@ -32,7 +32,7 @@ class SearchedLines(ABC):
 
     @abstractmethod
     def line(self, sample: mi.UInt32):
-        """The lines number `sample`."""
+        """The lines number `sample`; what chooses their delta lobes is their `lobe`."""
 
     @abstractmethod
     def ray(self, line, s: mi.Float) -> mi.Ray3f:
@@ -54,19 +54,20 @@ class SearchedLines(ABC):
             return
         sample = dr.arange(mi.UInt32, self.count)
         sampler = lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_GUIDE), sample)
-        ray = self.ray(self.line(sample), sampler.next_1d())
-        guide(self.world, ray, self._numbers(sample), sampler, sample, self.directions)
+        line = self.line(sample)
+        ray = self.ray(line, sampler.next_1d())
+        guide(self.world, ray, (self._numbers(sample), line.lobe), sampler, sample, self.directions)
         dr.eval(self.directions.data)
 
     def tell_effort(self, sample: mi.UInt32, segments: mi.UInt32) -> None:  # noqa: B027 (not all lines are on the film)
         """So many segments have been traced for the lines `sample`; for `Job.effort`."""
 
     def _numbers(self, sample: mi.UInt32):
-        """What chooses lobes and the points at the other end, for all chains of a line."""
+        """What chooses smooth lobes and the points at the other end, for all chains of a line."""
         return lane_sampler(stream_seed(self.job.seed, Stream.CHAIN_LOBES), sample)
 
     def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float], store: ChainRecords | None = None) -> Pair:
         """The chains from two places on the lines `sample`."""
         line = self.line(sample)
         rays = self.ray(line, ends[0]), self.ray(line, ends[1])
-        return trace_pair(self.world, rays, self._numbers(sample), (self.directions, sample), store)
+        return trace_pair(self.world, rays, (self._numbers(sample), line.lobe), (self.directions, sample), store)

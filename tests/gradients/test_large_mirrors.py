@@ -21,7 +21,7 @@ BORDER = 3  # [px] where `ptracer` misses what samples outside of the film bring
 STEP = 0.003  # of differences: the shadow of the roof's edge is narrow
 TOLERANCE = 1e-5  # of the adjoint identity
 BUDGETS = ("sppc", "sppp", "spps", "sppd", "sppi")
-X, TURN = (1, 0.3, 0.2), (0, 0, 1)
+X = (1, 0.3, 0.2)
 
 pytestmark = pytest.mark.filterwarnings("ignore::psdr_jit.errors.UnsupportedWarning")
 
@@ -96,8 +96,9 @@ def test_forward_and_backward_are_transposes(llvm):
 @pytest.mark.parametrize("light, param, how", [
     ("point", "roof.to_world", {"direction": X}), ("directional", "roof.to_world", {"direction": X}),
     ("point", "lamp.position", {"direction": X}), ("point", "floor.to_world", {"direction": (0, 1, 0)}),
-    ("directional", "floor.to_world", {"rotate": TURN}), ("directional", "camera.to_world", {"direction": X}),
+    ("directional", "camera.to_world", {"direction": X}),
 ])  # fmt: skip
 def test_what_moves(llvm, floor, light, param, how):
-    result = psdr_jit.check_gradient(room(floor, light), param, **how, integrator=BDPT, eps=STEP, max_seconds=200)
+    limits = {"eps": STEP, "max_seconds": 200, "max_stderr": 0.01}
+    result = psdr_jit.check_gradient(room(floor, light), param, **how, integrator=BDPT, **limits)
     assert result.passed, str(result)

@@ -7,21 +7,29 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit.boundary.chain_lobes import LEAST_LOBE, leave
+from psdr_jit.boundary.chain_lobes import LEAST_LOBE, SPENT, Leaving, LobeNumber, leave
 
 ETA, NUMBERS = 1.5, 1000
 
 
-def leaving(cos: float, inside: bool) -> tuple[np.ndarray, np.ndarray, float]:
-    """`(led through, factors, reflected share)` of evenly spread random numbers, at this cosine of incidence."""
-    bsdf = mi.load_dict({"type": "dielectric", "int_ior": ETA, "ext_ior": 1.0})
+def leave_pane(u: mi.Float, cos: float, inside: bool, plugin: str = "dielectric") -> Leaving:
+    """How random numbers have chains leave a pane that they meet at this cosine of incidence."""
+    bsdf = mi.load_dict({"type": plugin, "int_ior": ETA, "ext_ior": 1.0})
     scene = mi.load_dict({"type": "scene", "pane": {"type": "rectangle", "bsdf": bsdf}})
     up = -1 if inside else 1
     d = mi.Vector3f(float(np.sqrt(1 - cos**2)), 0, -up * cos)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0) - d, d))
-    u = (dr.arange(mi.Float, NUMBERS) + 0.5) / NUMBERS
-    onward = leave(si, mi.UInt32(0), mi.Point2f(0.5, u), None, mi.Bool(True), mi.BSDFContext())
-    F = float(mi.fresnel(mi.Float(up * cos), ETA)[0][0])
+    return leave(si, mi.UInt32(0), mi.Point2f(0.5, u), None, mi.Bool(True), mi.BSDFContext())
+
+
+def even() -> mi.Float:
+    return (dr.arange(mi.Float, NUMBERS) + 0.5) / NUMBERS
+
+
+def leaving(cos: float, inside: bool) -> tuple[np.ndarray, np.ndarray, float]:
+    """`(led through, factors, reflected share)` of evenly spread random numbers, at this cosine of incidence."""
+    onward = leave_pane(even(), cos, inside)
+    F = float(mi.fresnel(mi.Float(-cos if inside else cos), ETA)[0][0])
     return np.array(onward.through), np.array(onward.factor).mean(0), F
 
 
@@ -38,3 +46,27 @@ def test_both_lobes_are_worth_what_they_are(llvm, cos, inside):
 def test_total_reflection_leaves_no_choice(llvm):
     through, factor, F = leaving(0.3, inside=True)
     assert F == 1 and not through.any() and np.allclose(factor, 1)
+
+
+@pytest.mark.parametrize("plugin", ["dielectric", "psdr_dielectric", "thindielectric"])
+def test_what_is_left_of_a_number_is_uniform(llvm, plugin):
+    """So one number chooses lobes at several vertices, each as often as it should, whichever went before."""
+    first = leave_pane(even(), 0.9, False, plugin)
+    P, through, rest = np.array(first.probability), np.array(first.through), np.array(first.rest)
+    for lobe in (through, ~through):
+        assert np.allclose(np.sort(rest[lobe]), (np.arange(lobe.sum()) + 0.5) / lobe.sum(), atol=1 / lobe.sum())
+    number = LobeNumber.begin(even()).behind(first, mi.Bool(True))
+    second = leave_pane(number.u, 0.8, True, plugin)
+    both = through & np.array(second.through)
+    assert abs(both.mean() - P[through][0] * np.array(second.probability)[both][0]) < 2 / NUMBERS
+
+
+def test_a_spent_number_is_replaced(llvm):
+    number = LobeNumber(mi.Float(0.25, 0.25), mi.Float(1, 0.5 * SPENT)).or_fresh(mi.Float(0.75))
+    assert np.array_equal(number.u, [0.25, 0.75]) and np.array_equal(number.length, [1, 1])
+
+
+def test_nothing_is_spent_where_there_is_no_choice(llvm):
+    mirrored = leave_pane(even(), 0.3, True)
+    number = LobeNumber.begin(even()).behind(mirrored, mi.Bool(True))
+    assert np.allclose(number.u, even(), atol=1e-6) and np.array_equal(number.length, np.ones(NUMBERS))
