@@ -15,6 +15,7 @@ import mitsuba as mi
 from ..core.ad import backpropagate, tangents
 from ..core.records import Hit
 from .chain_outline import Curve, beside_cut, beside_line, crossed_curve
+from .chain_patterns import NO_FAMILY
 from .chain_sweeps import AtRest, slope_at_end
 from .chain_trace import ChainRecords, Pair
 from .searched_lines import SearchedLines
@@ -31,8 +32,24 @@ def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
     dr.eval(pair, chain.hits, chain.bends)
     sight = dr.select(pair.horizon, chain.segment(pair.sight, pair.horizon), pair.a)
     curve = crossed_curve(lines.analytic, lines.world.patterns, pair, sight)
+    curve.valid &= ~starts_behind(pair)
     dr.eval(curve)
     return chain, pair, curve
+
+
+def starts_behind(pair: Pair) -> mi.Bool:
+    """Do the paths part because one of them begins its segment behind the face of a mesh that the other meets?
+
+    Rays start a small height off their surfaces. Inside of a body with a sharp edge, as near to it as that height, they
+    start outside and never come back in: there is no such gap.
+    """
+    a, b = pair.a, pair.b
+    first = (a.shape != 0) & ((b.shape == 0) | (a.t < b.t))
+    met, other = dr.select(first, a, b), dr.select(first, b, a)
+    asked = (met.shape != 0) & (pair.last > 0) & ~pair.horizon & (pair.family == NO_FAMILY)
+    si = met.intersection().compute_surface_interaction(mi.Ray3f(met.o, met.d), mi.RayFlags.Minimal, asked)
+    behind = dr.dot(si.n, si.p - other.o) * dr.dot(si.n, met.d) <= 0
+    return asked & si.shape.is_mesh() & behind
 
 
 def beside_curve(lines: SearchedLines, pair: Pair, curve: Curve) -> Pair:

@@ -165,7 +165,7 @@ class Numbers:
 
 @dr.syntax
 def guide(world: ChainWorld, ray: mi.Ray3f, numbers: tuple, sampler, line: mi.UInt32, out: Directions):
-    """Follow a chain of every line and draw the directions that it keeps. `numbers` as for `trace_pair`. Fills `out`."""
+    """Follow a chain of every line, draw the directions that it keeps. `numbers` as for `trace_pair`. Fills `out`."""
     ray, k, active = mi.Ray3f(ray), mi.UInt32(0), mi.Bool(True)
     rng, lobe = numbers[0], LobeNumber.begin(numbers[1])
     ctx = mi.BSDFContext(world.mode)

@@ -1,0 +1,49 @@
+"""Bodies of glass with sharp edges: rays start a small height off faces, and beside such an edge outside of the body.
+
+Under a sky, a convex body shows what is mirrored in it and nothing else if paths end at their second vertex: no chain
+sees a step, so the term is 0, exactly.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import forward
+
+from psdr_jit.derivative.perturbation import perturb
+
+FACES = np.array([(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)])
+ALONE = dict.fromkeys(("sppc", "sppp", "sppd", "sppi"), 0)
+
+
+def wedge(angle: float) -> mi.Mesh:
+    """A prism along z, 1 long, two sides of which meet at this angle [degrees] and are as long, normals outward."""
+    half = np.deg2rad(angle / 2)
+    corners = np.array([(0, 0), (np.cos(half), np.sin(half)), (np.cos(half), -np.sin(half))])
+    positions = np.array([(x - 0.5, y, z) for z in (0.5, -0.5) for x, y in corners])
+    props = mi.Properties()
+    props["bsdf"], props["face_normals"] = mi.load_dict({"type": "dielectric"}), True
+    mesh = mi.Mesh("wedge", len(positions), len(FACES), props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"], params["faces"] = positions.ravel().astype(np.float32), FACES.ravel().astype(np.uint32)
+    params.update()
+    return mesh
+
+
+def scene(angle: float) -> mi.Scene:
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    pose = mi.ScalarTransform4f().look_at(origin=[-0.5, 3, 0.8], target=[0, 0, 0], up=[1, 0, 0])
+    return mi.load_dict({
+        "type": "scene", "wedge": wedge(angle), "sky": {"type": "constant"},
+        "camera": {"type": "perspective", "fov": 30, "film": film, "to_world": pose},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("angle", [15.0, 40.0])
+def test_no_light_leaks_through_sharp_edges(llvm, angle):
+    motion = perturb(scene(angle), "wedge.vertex_positions", (1, 0.3, 0.2))
+    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial"}
+    chain, whole = (forward(motion, {**spec, **budgets}, 2, 64) for budgets in ({**ALONE, "spps": 64}, {}))
+    assert np.abs(whole).max() > 1, "nothing to be seen that could be wrong"
+    assert np.abs(chain).max() < 1e-3 * np.abs(whole).max()
