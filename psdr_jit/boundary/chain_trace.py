@@ -185,11 +185,7 @@ def guide(world: ChainWorld, ray: mi.Ray3f, numbers: tuple, sampler, line: mi.UI
 
 @dr.syntax
 def trace_pair(
-    world: ChainWorld,
-    rays: tuple[mi.Ray3f, mi.Ray3f],
-    numbers: tuple,
-    fixed: tuple[Directions, mi.UInt32],
-    store: ChainRecords | None,
+    world: ChainWorld, rays: tuple[mi.Ray3f, mi.Ray3f], numbers: tuple, fixed: tuple, store: ChainRecords | None
 ):
     """Follow two chains as long as they meet the same surfaces; `store` keeps the segments of the first.
 

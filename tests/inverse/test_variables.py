@@ -151,3 +151,28 @@ def test_vertices_return_to_the_mesh(llvm):
         assert 0.005 < variable.offset(variable.start(latents, np.random.default_rng(2)))["rms"] < 0.2
     with pytest.raises(ParameterError, match="vertex_positions"):
         begin(Vertices("view0.to_world", 0.1), scene)
+
+
+@pytest.mark.parametrize("smoothness", [0.0, 10.0])
+def test_a_height_field_moves_along_one_axis(llvm, smoothness):
+    """Whatever the latent says: the gradient of the other coordinates is 0, and so is a perturbed start's change."""
+    scene = scene_io.load_scene(scene_io.shipped_scene("inverse/lens.xml"), res=8)
+    variable = Vertices("lens.vertex_positions", 0.1, smoothness, axes="y", spread=0.1, spread_bumps=0.02)
+    latents = begin(variable, scene)
+    own = numbers(mi.traverse(scene)["lens.vertex_positions"]).reshape(-1, 3)
+    moved = numbers(variable.value({"u": latents["u"] + 0.01})).reshape(-1, 3)
+    assert np.array_equal(moved[:, [0, 2]], own[:, [0, 2]]) and np.all(moved[:, 1] > own[:, 1])
+    start = numbers(variable.value(variable.start(latents, np.random.default_rng(2)))).reshape(-1, 3)
+    assert np.array_equal(start[:, [0, 2]], own[:, [0, 2]]) and np.std(start[:, 1]) == pytest.approx(0.02, rel=0.2)
+    u = mi.Float(latents["u"])
+    dr.enable_grad(u)
+    dr.backward(dr.sum(dr.square(variable.value({"u": u}) + 1)))
+    slope = numbers(dr.grad(u)).reshape(-1, 3)
+    assert np.abs(slope[:, [0, 2]]).max() < 1e-6 < np.abs(slope[:, 1]).min()
+
+
+@pytest.mark.parametrize("axes", ["", "yy", "yw"])
+def test_axes_of_vertices(llvm, axes):
+    with pytest.raises(OptionError, match="expected letters out of xyz"):
+        begin(Vertices("lens.vertex_positions", 0.1, axes=axes), scene_io.load_scene(
+            scene_io.shipped_scene("inverse/lens.xml"), res=8))  # fmt: skip
