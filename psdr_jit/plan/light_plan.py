@@ -60,8 +60,11 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     """Numbers of the lights in the scene that are traced.
 
     Not smooth-shaded meshes: Mitsuba weighs what emitter sampling finds there by other normals than what scattering
-    does, and light subpaths can agree with one of them only.
+    does, and light subpaths can agree with one of them only. Nor, beside smooth-shaded mirrors and glass, any light
+    that camera paths find: delta lobes about normals that are not the surface's do not keep étendue, which the weights
+    of `paths.light_technique` take for granted.
     """
+    uneven = any(s.smooth and s.is_mesh for s in _mirrors(facts))
 
     def even(shape: ShapeFacts) -> bool:
         return shape.index >= 0 and not shape.smooth and shape.kind in ("mesh", "analytic")
@@ -69,7 +72,8 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     return [
         k
         for k, light in enumerate(facts.emitters)
-        if light.plugin in TRACED and (light.shape < 0 or even(facts.shapes[light.shape]))
+        if light.plugin in TRACED and (light.delta or not uneven)
+        and (light.shape < 0 or even(facts.shapes[light.shape]))
     ]
 
 
@@ -110,7 +114,8 @@ def plan_light(
     _warn_about_unseen_light(facts, targets, memory)
     for obstacle, reason in (
         (not narrow_shapes(facts) and not targets, "no surface is glass or a mirror, nothing is focused"),
-        (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)}"),
+        (not traced_lights(facts), f"no light is of the kinds that are traced: {', '.join(TRACED)} (beside "
+                                   "smooth-shaded mirrors and glass the last three)"),
         (not targets, "glass and mirrors span the scene, there is nothing to aim at"),
         (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
         (facts.sensor.plugin not in KINDS.values(), f"nothing is connected to a '{facts.sensor.plugin}' sensor"),

@@ -13,6 +13,7 @@ from helpers import adjoint_identity, functionals, z_scores
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import UnsupportedWarning
+from psdr_jit.scene.io import shipped_scene
 
 LIMITS = {"max_depth": 4, "rr_depth": 1000}
 BDPT = {"type": "psdr_bdpt", **LIMITS}
@@ -77,6 +78,23 @@ def test_area_lights_need_no_such_help(llvm):
     })  # fmt: skip
     plan = psdr_jit.make_plan(scene, ["card.to_world"], integrator=BDPT)
     assert not plan.light.runs and "nothing to aim at" in plan.light.reason
+
+
+@pytest.mark.parametrize(("light", "runs"), [
+    ({"type": "sphere", "radius": 0.1, "center": [0, 0, 3], "emitter": {"type": "area"}}, False),
+    ({"type": "point", "position": [0, 0, 3]}, True),
+], ids=["area", "point"])  # fmt: skip
+def test_smooth_shaded_glass_is_left_to_camera_paths_where_they_see_it(llvm, light, runs):
+    """Its lobes do not keep étendue: derivatives by light subpaths were off where those by camera paths are not."""
+    scene = mi.load_dict({
+        "type": "scene", "lamp": light, "camera": {"type": "perspective", "film": {
+            "type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "gaussian"}}},
+        "ball": {"type": "obj", "filename": str(shipped_scene("meshes/smooth_sphere.obj")),
+                 "bsdf": {"type": "dielectric"}},
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -5]).scale(9)},
+    }, optimize=False)  # fmt: skip
+    plan = psdr_jit.make_plan(scene, ["ball.vertex_positions"], integrator=BDPT)
+    assert plan.light.runs == runs and (runs or "smooth-shaded" in plan.light.reason)
 
 
 def test_no_light_is_said_to_be_missing_from_the_image(llvm):
