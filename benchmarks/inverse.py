@@ -29,6 +29,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.errors import PsdrError
 from psdr_jit.inverse import config, loop
 from psdr_jit.inverse.targets import rendered
+from psdr_jit.inverse.variables import rms
 
 NAME = "inverse"
 BUDGET = 600.0  # [s] longest run
@@ -83,7 +84,7 @@ def caustic_error(problem: Any, latents: Any) -> float:
     spec = {"type": "psdr_bdpt", "max_depth": integrator_specs.path_options(problem.integrator)["max_depth"]}
     seen = problem.views[0]
     image = rendered(problem.scene, seen.sensor, integrator_specs.build(spec), CAUSTIC_SPP)
-    return float(np.sqrt(np.mean((image - np.array(seen.target)) ** 2)))
+    return rms(image - np.array(seen.target))
 
 
 CAUSTIC_SPP = 2048  # of its picture, whose noise is far below what counts as solved
@@ -94,6 +95,13 @@ SHADOW_SIZE = 3.0  # [units] from the lamp to the floor
 SPOT, CAUSTIC_SIZE = "lamp.to_world", 3.3  # [units] from the spotlight to the floor
 LEFT, RIGHT, BRIGHTNESS = "left:lamp.intensity.value", "right:lamp.intensity.value", 10.0
 MIRROR_SIZE = 3.0  # [units] from the mirror to the end of what it shows
+
+
+
+def of_glass_and_spot(file: str) -> Example:
+    figures = named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE))
+    return Example(file, figures, {"ior": below(0.01), "spot": below(0.01)})
+
 
 EXAMPLES = {
     "rotation": Example(
@@ -121,16 +129,8 @@ EXAMPLES = {
         named(ior=offset(IOR, "rms"), distance=offset(BALL, "distance")),
         {"ior": below(0.01), "distance": below(0.01)},
     ),
-    "caustic": Example(
-        "caustic",
-        named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
-        {"ior": below(0.01), "spot": below(0.01)},
-    ),
-    "smooth_caustic": Example(
-        "smooth_caustic",
-        named(ior=offset(IOR, "rms"), spot=offset(SPOT, "distance", CAUSTIC_SIZE)),
-        {"ior": below(0.01), "spot": below(0.01)},
-    ),
+    "caustic": of_glass_and_spot("caustic"),
+    "smooth_caustic": of_glass_and_spot("smooth_caustic"),
     "lens": Example("lens", named(caustic=caustic_error), {"caustic": tenth}),
     "lamps": Example(
         "lamps",

@@ -50,6 +50,26 @@ def fd(motion: Perturbation, spec: dict, eps: float, seeds: int, spp: int) -> np
     return np.concatenate([half.group_means() for half in difference.halves])
 
 
+def images(scene: mi.Scene, spec: dict, spp: int, seeds: int, first: int = 0) -> np.ndarray:
+    """Of several seeds, (seeds, H, W, C)."""
+    integrator = integrator_specs.build(spec)
+    rendered = [mi.render(scene, integrator=integrator, spp=spp, seed=first + k) for k in range(seeds)]
+    return np.stack([integrator_specs.to_image(image) for image in rendered])
+
+
+def mesh_of(points: np.ndarray, faces: np.ndarray, **props) -> mi.Mesh:
+    """A mesh named "shape" with properties such as its BSDF."""
+    given = mi.Properties()
+    for name, value in props.items():
+        given[name] = mi.load_dict(value) if isinstance(value, dict) else value
+    mesh = mi.Mesh("shape", len(points), len(faces), props=given)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = points.ravel().astype(np.float32)
+    params["faces"] = faces.ravel().astype(np.uint32)
+    params.update()
+    return mesh
+
+
 def motion_of(problem: Problem, scene: mi.Scene) -> Perturbation:
     return perturb(scene, problem.param, **problem.how)
 

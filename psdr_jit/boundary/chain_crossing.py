@@ -47,7 +47,7 @@ def starts_behind(pair: Pair) -> mi.Bool:
     first = (a.shape != 0) & ((b.shape == 0) | (a.t < b.t))
     met, other = dr.select(first, a, b), dr.select(first, b, a)
     asked = (met.shape != 0) & (pair.last > 0) & ~pair.horizon & (pair.family == NO_FAMILY)
-    si = met.intersection().compute_surface_interaction(mi.Ray3f(met.o, met.d), mi.RayFlags.Minimal, asked)
+    si = met.interaction(asked, mi.RayFlags.Minimal)
     behind = dr.dot(si.n, si.p - other.o) * dr.dot(si.n, met.d) <= 0
     return asked & si.shape.is_mesh() & behind
 
@@ -64,7 +64,7 @@ def sampled_as_edge(pair: Pair, sight: Hit) -> mi.Bool:
     (`edges.kind_mirror_horizon`), or if they lie on an edge. `sight`: the segment that meets the crossed curve.
     """
     seen = pair.horizon & (pair.sight == 0)
-    si = sight.intersection().compute_surface_interaction(mi.Ray3f(sight.o, sight.d), mi.RayFlags.All, seen)
+    si = sight.interaction(seen)
     reflected = dr.dot(si.sh_frame.n, pair.a.d) * dr.dot(si.sh_frame.n, sight.d) < 0
     return seen & (reflected | ~pair.one_face)
 

@@ -101,6 +101,5 @@ class Guesses:
     @staticmethod
     def _turned(hit: Hit, active: mi.Bool) -> mi.Float:
         """n·d of the shading normal."""
-        ray = mi.Ray3f(hit.o, hit.d)
-        si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = hit.interaction(active)
         return dr.dot(si.sh_frame.n, hit.d)

@@ -19,7 +19,7 @@ from ..plan.job import Job
 from .chain_aims import ChainAims
 from .chain_fixed import Directions
 from .chain_trace import ChainWorld
-from .searched_lines import SearchedLines
+from .searched_lines import SearchedLines, either
 
 #: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
 NARROWEST = 2.0**-10
@@ -68,10 +68,9 @@ class Lines(SearchedLines):
         rng = self.samples.sampler(stream_seed(self.job.seed, Stream.CHAIN_LINE), sample)
         corner = self.samples.corner_of(self.samples.place(sample)[0])
         u = rng.next_2d()  # together: half of the lines are horizontal, and their offsets well spread among themselves
-        horizontal, offset = u.x < 0.5, u.y
+        (horizontal, lobe), offset = either(u.x), u.y
         aperture, wavelength = rng.next_2d(), rng.next_1d()
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
-        lobe = dr.select(horizontal, 2 * u.x, 2 * u.x - 1)  # well spread among the lines of either direction
         return Line(start, horizontal, aperture, wavelength, lobe)
 
     def per_pixel(self, sample: mi.UInt32) -> mi.Float:

@@ -205,17 +205,13 @@ def _outline(shapes: AnalyticShapes | None, hit: Hit, p: mi.Point3f, line: mi.Ra
     return edge if shapes is None else _closer(edge, _analytic_outline(shapes, hit, p, line))
 
 
-def _interaction(hit: Hit) -> mi.SurfaceInteraction3f:
-    return hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), mi.RayFlags.All)
-
-
 def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None, pair: Pair, sight: Hit) -> Curve:
     """The curve between the two chains, for the line of sight of the first: its segment `sight`."""
     line = mi.Ray3f(sight.o, sight.d)
     first = pair.a.intersection().t <= pair.b.intersection().t
     near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
     near, far = (dr.select(pair.horizon, sight, hit) for hit in (near, far))
-    si_near, si_far = _interaction(near), _interaction(far)
+    si_near, si_far = near.interaction(), far.interaction()
     best = _outline(shapes, near, si_near.p, line)
     touching = (far.shape != 0) & (far.t - near.t < TOUCHING * far.t)
     other = _outline(shapes, far, si_far.p, line)
@@ -237,7 +233,7 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
     pattern, g, side = mi.Bool(False), mi.Vector2f(0), dr.select(first ^ in_front, mi.Float(-1), 1)
     if patterns is not None:
         pattern = pair.family != NO_FAMILY
-        g, F_line, side_line = patterns.line(pair.family, _interaction(pair.a), _interaction(pair.b))
+        g, F_line, side_line = patterns.line(pair.family, pair.a.interaction(), pair.b.interaction())
         F, shading, side = dr.select(pattern, F_line, F), shading & ~pattern, dr.select(pattern, side_line, side)
     horizon = pair.horizon & pair.one_face
     F = dr.select(horizon, dr.dot(si_near.n, pair.a.d), F)
@@ -262,8 +258,7 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
 
 def beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
     """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
-    ray = mi.Ray3f(pair.a.o, pair.a.d)
-    si = pair.a.intersection().compute_surface_interaction(ray, mi.RayFlags.All, curve.pattern)
+    si = pair.a.interaction(curve.pattern)
     across = curve.g * (INSET / dr.squared_norm(curve.g))
     step = si.dp_du * across.x + si.dp_dv * across.y
     crossed = curve.pattern & dr.all(dr.isfinite(step))
@@ -280,7 +275,7 @@ def beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
     """
     n = mi.Vector3f(curve.c1 + curve.c2)
     crossed = curve.cut & ~pair.in_light & dr.isfinite(curve.side)
-    n_a, n_b = (_interaction(hit).n for hit in (pair.a, pair.b))
+    n_a, n_b = (hit.interaction().n for hit in (pair.a, pair.b))
     cot = dr.abs(dr.dot(n_a, n_b)) / dr.maximum(dr.norm(dr.cross(n_a, n_b)), LEAST_SLANT)
     x = curve.line.o + curve.t * curve.line.d
     return _moved(scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)

@@ -44,7 +44,7 @@ from ..sampling.distribution import EdgeDistribution, edge_distribution, pmf, sa
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import LEAST_WIDTH
 from .chain_trace import CHAIN_DEPTH, ChainWorld, Numbers, Pair
-from .searched_lines import SearchedLines
+from .searched_lines import SearchedLines, either
 
 #: Cells along one side of the square.
 CELLS = 64
@@ -186,9 +186,7 @@ class LightLines(SearchedLines):
         for i, ball in enumerate(self._targets):
             seen = self._bundle(light, place, ball, far)
             y, axis, density = (dr.select(target == i, *v) for v in zip(seen, (y, axis, density), strict=True))
-        way, offset, wavelength = rng.next_1d(), rng.next_1d(), rng.next_1d()
-        horizontal = way < 0.5
-        lobe = dr.select(horizontal, 2 * way, 2 * way - 1)
+        (horizontal, lobe), offset, wavelength = either(rng.next_1d()), rng.next_1d(), rng.next_1d()
         corner = mi.Point2f(mi.Float(cell % CELLS), mi.Float(cell // CELLS))
         start = corner + dr.select(horizontal, mi.Point2f(0, offset), mi.Point2f(offset, 0))
         side = 2 / CELLS * dr.rsqrt(dr.pi * density)  # R² = Ω/π

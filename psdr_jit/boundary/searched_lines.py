@@ -20,6 +20,12 @@ from .chain_outline import AnalyticShapes
 from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
 
 
+def either(u: mi.Float) -> tuple[mi.Bool, mi.Float]:
+    """One of two at even chances, and what is left of the random number `u`: uniform, well spread within each."""
+    first = u < 0.5
+    return first, dr.select(first, 2 * u, 2 * u - 1)
+
+
 class SearchedLines(ABC):
     """The lines of a job, numbered from 0. Host object."""
 

@@ -56,6 +56,10 @@ class Hit:
         pi.prim_uv = self.prim_uv
         return pi
 
+    def interaction(self, active: mi.Bool | bool = True, flags=mi.RayFlags.All) -> mi.SurfaceInteraction3f:
+        """The surface that the ray met. Detached, unless `flags` follow the shape."""
+        return self.intersection().compute_surface_interaction(mi.Ray3f(self.o, self.d), flags, active)
+
 
 @dataclass
 class EmitterSample:

@@ -39,5 +39,5 @@ def _moved(s: Sheet, n: mi.Vector3f, t: mi.Float, x: mi.Point3f, active) -> mi.V
     height = PROBE * (1 + dr.max(dr.abs(x)))
     hit = Hit(x + height * n, -n, height, s.shape, s.prim, s.uv_start + t * (s.uv_end - s.uv_start))
     follow = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    p = hit.intersection().compute_surface_interaction(mi.Ray3f(hit.o, hit.d), follow, active).p
+    p = hit.interaction(active, follow).p
     return p - dr.detach(p)

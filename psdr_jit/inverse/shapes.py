@@ -13,7 +13,7 @@ import numpy as np
 from psdr_jit.core.compat import VERTEX_POSITIONS
 from psdr_jit.core.upload import uploaded
 from psdr_jit.errors import OptionError, ParameterError, SetupError
-from psdr_jit.inverse.variables import AXES, copy_of, like, numbers, rms
+from psdr_jit.inverse.variables import AXES, copy_of, like, numbers, require_axes, rms
 from psdr_jit.scene.params import find_param
 
 #: Distance in the cross-section, relative to its extent, below which vertices belong to the same point of it.
@@ -56,8 +56,9 @@ class Vertices:
         positions = _positions(scene, self.parameter, params)
         if not self.smoothness >= 0:
             raise OptionError(f"'{self.parameter}': smoothness = {self.smoothness} must not be negative")
-        if not self.axes or not set(self.axes) <= set(AXES) or len(set(self.axes)) < len(self.axes):
-            raise OptionError(f"'{self.parameter}': axes = {self.axes!r}: expected letters out of xyz, each once")
+        require_axes(self.parameter, "axes", self.axes)
+        if not self.axes:
+            raise OptionError(f"'{self.parameter}': axes = '': expected letters out of xyz, or it may not move")
         self._own = numbers(positions)
         if self.smoothness > 0:
             faces = mi.UInt32(params[self.parameter[: -len(VERTEX_POSITIONS)] + "faces"])
@@ -85,16 +86,20 @@ class Vertices:
         if self.spread_bumps > 0:
             bumps = numbers(self._positions(uploaded(mi.Float, rng.normal(size=p.size).astype(np.float32))))
             moved += (bumps * (self.spread_bumps / rms(bumps))).reshape(-1, 3)
-        free = [axis in self.axes for axis in AXES]
-        return {"u": self._latent(uploaded(mi.Float, np.where(free, moved, p).astype(np.float32)))}
+        return {"u": self._latent(uploaded(mi.Float, np.where(self._free, moved, p).astype(np.float32)))}
 
     def value(self, latents: Mapping[str, Any]) -> Any:
         found = self._positions(latents["u"])
-        if set(self.axes) == set(AXES):
+        if all(self._free):
             return found
         axis = dr.arange(mi.UInt32, dr.width(found)) % len(AXES)
-        free = dr.gather(mi.Bool, mi.Bool([name in self.axes for name in AXES]), axis)
+        free = dr.gather(mi.Bool, mi.Bool(self._free), axis)
         return dr.select(free, found, uploaded(mi.Float, self._own.astype(np.float32)))
+
+    @property
+    def _free(self) -> list[bool]:
+        """By axis: may vertices move along it?"""
+        return [axis in self.axes for axis in AXES]
 
     def _positions(self, u: mi.Float) -> mi.Float:
         return u if self._steps is None else self._steps.from_differential(u)

@@ -155,9 +155,7 @@ class Pose:
                 'of a light; use a variable of kind "parameter"'
             )
         for name in ("shift", "turn"):
-            axes = self._axes(name)
-            if not set(axes) <= set(AXES) or len(set(axes)) < len(axes):
-                raise OptionError(f"'{self.parameter}': {name}_axes = {axes!r}: expected letters out of xyz, each once")
+            require_axes(self.parameter, f"{name}_axes", self._axes(name))
         if not self.shift_axes and not self.turn_axes:
             raise OptionError(f"'{self.parameter}': it may neither shift nor turn; give shift_axes or turn_axes")
         if info.shape != (4, 4) and last == "position" and (self.turn_axes or self.pivot is not None):
@@ -280,6 +278,12 @@ def broadcast(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     if not np.all(np.isfinite(array)):
         raise ParameterError(f"{what} is not finite")
     return array
+
+
+def require_axes(parameter: str, option: str, axes: str) -> None:
+    """Raises `OptionError` unless `axes` are letters out of xyz, each once at most."""
+    if not set(axes) <= set(AXES) or len(set(axes)) < len(axes):
+        raise OptionError(f"'{parameter}': {option} = {axes!r}: expected letters out of xyz, each once")
 
 
 def rms(values: np.ndarray) -> float:

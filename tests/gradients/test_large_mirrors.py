@@ -8,7 +8,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, functionals, z_scores
+from helpers import adjoint_identity, functionals, images, z_scores
 
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
@@ -51,10 +51,8 @@ MIRROR = {"type": "conductor", "material": "none"}
 PLASTIC = {"type": "plastic", "int_ior": 2.5, "diffuse_reflectance": 0.1}  # so that it throws back enough to be seen
 
 
-def images(scene: mi.Scene, spec: dict, spp: int) -> np.ndarray:
-    integrator = integrator_specs.build(spec)
-    rendered = [mi.render(scene, integrator=integrator, spp=spp, seed=k) for k in range(SEEDS)]
-    return np.stack([integrator_specs.to_image(image)[BORDER:-BORDER, BORDER:-BORDER] for image in rendered])
+def inner_images(scene: mi.Scene, spec: dict, spp: int) -> np.ndarray:
+    return images(scene, spec, spp, SEEDS)[:, BORDER:-BORDER, BORDER:-BORDER]
 
 
 @pytest.mark.parametrize("floor, light", [
@@ -63,10 +61,10 @@ def images(scene: mi.Scene, spec: dict, spp: int) -> np.ndarray:
 ], ids=["mirror-point", "plastic-directional", "plastic-point", "mirror-directional"])  # fmt: skip
 def test_image(llvm, floor, light):
     scene = room(floor, light)
-    ours, particles = images(scene, BDPT, 64), images(scene, {"type": "ptracer", **LIMITS}, 512)
+    ours, particles = inner_images(scene, BDPT, 64), inner_images(scene, {"type": "ptracer", **LIMITS}, 512)
     weights = functionals(ours.shape[1:])
     assert np.abs(z_scores(ours, particles, weights)).max() < 5
-    without = images(scene, {**BDPT, "light_paths": "off"}, 64)
+    without = inner_images(scene, {**BDPT, "light_paths": "off"}, 64)
     assert np.abs(z_scores(without, ours, weights)).max() > 5, "what the floor throws back could have been missing"
 
 

@@ -11,7 +11,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, assert_grad_close, fd, forward, functionals, kernels_compiled, load, z_scores
+from helpers import (
+    adjoint_identity,
+    assert_grad_close,
+    fd,
+    forward,
+    functionals,
+    images,
+    kernels_compiled,
+    load,
+    z_scores,
+)
 from problems import Problem
 
 from psdr_jit import make_plan
@@ -38,15 +48,9 @@ def bdpt(light_paths: str = "auto", **options) -> dict:
     return {"type": "psdr_bdpt", "light_paths": light_paths, **LIMITS, **options}
 
 
-def images(scene: mi.Scene, spec: dict, spp: int, first: int = 0) -> np.ndarray:
-    integrator = mi.load_dict(spec)
-    rendered = [mi.render(scene, integrator=integrator, spp=spp, seed=first + k) for k in range(SEEDS)]
-    return np.stack([integrator_specs.to_image(image) for image in rendered])
-
-
 def assert_image_of_path(scene: mi.Scene, spec: dict, spp: int) -> None:
     limits = {key: spec[key] for key in ("max_depth", "rr_depth", "hide_emitters") if key in spec}
-    path, ours = images(scene, {"type": "path", **limits}, spp, 1000), images(scene, spec, spp)
+    path, ours = images(scene, {"type": "path", **limits}, spp, SEEDS, 1000), images(scene, spec, spp, SEEDS)
     assert np.isfinite(ours).all()
     weights = functionals(ours.shape[1:])
     assert np.abs(z_scores(ours, path, weights)).max() < Z_LIMIT

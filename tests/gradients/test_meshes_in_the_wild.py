@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fuzz.meshes import box as cube
-from helpers import TERMS, assert_grad_close, fd, forward
+from helpers import TERMS, assert_grad_close, fd, forward, mesh_of
 
 from benchmarks import meshes
 from psdr_jit.derivative.integrator_specs import build
@@ -57,13 +57,7 @@ def stack() -> tuple[np.ndarray, np.ndarray]:
 def scene_of(points: np.ndarray, faces: np.ndarray) -> mi.Scene:
     """The mesh above a floor, under a lamp."""
     grey = {"type": "diffuse", "reflectance": 0.7}
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": grey})
-    mesh = mi.Mesh("shape", len(points), len(faces), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = points.ravel().astype(np.float32)
-    params["faces"] = faces.ravel().astype(np.uint32)
-    params.update()
+    mesh = mesh_of(points, faces, bsdf={"type": "twosided", "bsdf": grey})
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     view = T().look_at(origin=[1.1, -5, 2.1], target=[0, 0, 0], up=[0, 0, 1])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import fd, forward
+from helpers import fd, forward, mesh_of
 
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import block_means, block_test, gain
@@ -52,14 +52,7 @@ def flat(plugin: str, pose: tuple[float, float] = TILTED) -> dict:
 
 def open_mesh(points: np.ndarray, faces: np.ndarray) -> mi.Mesh:
     """A two-sided mesh in the same pose."""
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(TWO_SIDED)
-    mesh = mi.Mesh("shape", len(points), len(faces), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = (points @ np.array(leaning(*TILTED).matrix)[:3, :3].T).ravel().astype(np.float32)
-    params["faces"] = faces.ravel().astype(np.uint32)
-    params.update()
-    return mesh
+    return mesh_of(points @ np.array(leaning(*TILTED).matrix)[:3, :3].T, faces, bsdf=TWO_SIDED)
 
 
 def tube(segments: int = 24) -> mi.Mesh:

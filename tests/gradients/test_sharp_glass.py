@@ -9,7 +9,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import forward
+from helpers import forward, mesh_of
 
 from psdr_jit.derivative.perturbation import perturb
 
@@ -22,13 +22,7 @@ def wedge(angle: float) -> mi.Mesh:
     half = np.deg2rad(angle / 2)
     corners = np.array([(0, 0), (np.cos(half), np.sin(half)), (np.cos(half), -np.sin(half))])
     positions = np.array([(x - 0.5, y, z) for z in (0.5, -0.5) for x, y in corners])
-    props = mi.Properties()
-    props["bsdf"], props["face_normals"] = mi.load_dict({"type": "dielectric"}), True
-    mesh = mi.Mesh("wedge", len(positions), len(FACES), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"], params["faces"] = positions.ravel().astype(np.float32), FACES.ravel().astype(np.uint32)
-    params.update()
-    return mesh
+    return mesh_of(positions, FACES, bsdf={"type": "dielectric"}, face_normals=True)
 
 
 def scene(angle: float) -> mi.Scene:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, assert_grad_close, forward, functionals, z_scores
+from helpers import adjoint_identity, assert_grad_close, forward, functionals, images, z_scores
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference
@@ -79,12 +79,6 @@ def glass_ball(light: str = "spot", sensor: str = "perspective", rfilter: str = 
     }, optimize=False)  # fmt: skip
 
 
-def images(scene: mi.Scene, spec: dict, spp: int, seeds: int = SEEDS, first: int = 0) -> np.ndarray:
-    integrator = integrator_specs.build(spec)
-    rendered = [mi.render(scene, integrator=integrator, spp=spp, seed=first + k) for k in range(seeds)]
-    return np.stack([integrator_specs.to_image(image) for image in rendered])
-
-
 def differences(motion, spec: dict, eps: float, spp: int) -> np.ndarray:
     """Of the image that `spec` itself makes, (SEEDS, H, W, C)."""
     difference = CentralDifference(motion, spec, 0, spp, eps, groups=SEEDS // 2)
@@ -97,8 +91,8 @@ def differences(motion, spec: dict, eps: float, spp: int) -> np.ndarray:
 def test_image_of_an_area_light(llvm, light, light_paths):
     """Weights of both ways add up to one, whatever is found by whom."""
     scene = glass_ball(light)
-    path = images(scene, {"type": "path", **LIMITS}, 2048, first=1000)
-    ours = images(scene, bdpt(light_paths=light_paths), 128)
+    path = images(scene, {"type": "path", **LIMITS}, 2048, SEEDS, 1000)
+    ours = images(scene, bdpt(light_paths=light_paths), 128, SEEDS)
     weights = functionals(ours.shape[1:])
     assert np.abs(z_scores(ours, path, weights)).max() < 5
     assert np.abs(z_scores(0.9 * ours, path, np.ones_like(weights[:1]))).max() > 5, "no power to tell a tenth"
@@ -106,8 +100,8 @@ def test_image_of_an_area_light(llvm, light, light_paths):
 
 def test_image_of_a_point(variant):
     """In a mirror: as of a second light behind it."""
-    exact = images(mirrored(False), {"type": "path", "max_depth": 2}, 256, first=1000)
-    ours = images(mirrored(True), bdpt(), 64)
+    exact = images(mirrored(False), {"type": "path", "max_depth": 2}, 256, SEEDS, 1000)
+    ours = images(mirrored(True), bdpt(), 64, SEEDS)
     assert np.abs(z_scores(ours, exact, functionals(ours.shape[1:]))).max() < 5
     assert abs(ours.mean() / exact.mean() - 1) < 0.01 and exact.mean() > 0.01
 

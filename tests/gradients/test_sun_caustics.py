@@ -9,8 +9,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import adjoint_identity, assert_grad_close, forward, functionals, z_scores
-from test_smooth_caustics import INTERIOR, LIMITS, SEEDS, TOLERANCE, X, bdpt, film, floor, images
+from helpers import adjoint_identity, assert_grad_close, forward, functionals, images, z_scores
+from test_smooth_caustics import INTERIOR, LIMITS, SEEDS, TOLERANCE, X, bdpt, film, floor
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
@@ -64,7 +64,7 @@ def glass(far: bool, body: str = "ball", card: bool = False, r: float = FAR) -> 
 
 def patch(scene: mi.Scene, spp: int) -> np.ndarray:
     """What the mirror adds, well inside of the patch that it lights."""
-    ours, path = images(scene, bdpt(), spp), images(scene, {"type": "path", **LIMITS}, spp)
+    ours, path = images(scene, bdpt(), spp, SEEDS), images(scene, {"type": "path", **LIMITS}, spp, SEEDS)
     return (ours.mean(0) - path.mean(0))[8:10, 6:9]
 
 
@@ -87,7 +87,7 @@ def test_a_mirror_in_a_turning_sun(llvm):
 @pytest.mark.slow
 @pytest.mark.parametrize("body", ["ball", "cube"])
 def test_image_of_glass(llvm, body):
-    near, far = (images(glass(far, body), bdpt(), 256) for far in (False, True))
+    near, far = (images(glass(far, body), bdpt(), 256, SEEDS) for far in (False, True))
     weights = functionals(far.shape[1:])
     assert np.abs(z_scores(far, near, weights)).max() < 5
     assert np.abs(z_scores(0.97 * far, near, np.ones_like(weights[:1]))).max() > 5, "no power to tell 3 %"
@@ -98,8 +98,8 @@ def test_image_of_glass(llvm, body):
 def test_image_of_rough_glass(llvm, light_paths):
     """Where camera paths find the light as well: weights of both ways add up to one."""
     scene = glass(True, "rough ball")
-    path = images(scene, {"type": "path", **LIMITS}, 2048, first=1000)
-    ours = images(scene, bdpt(light_paths=light_paths), 256)
+    path = images(scene, {"type": "path", **LIMITS}, 2048, SEEDS, 1000)
+    ours = images(scene, bdpt(light_paths=light_paths), 256, SEEDS)
     weights = functionals(ours.shape[1:])
     assert np.abs(z_scores(ours, path, weights)).max() < 5
     assert np.abs(z_scores(0.95 * ours, path, np.ones_like(weights[:1]))).max() > 5, "no power to tell 5 %"
