@@ -17,7 +17,7 @@ it (`edges.kind_mirror_horizon`); paths that leave their first vertex by a smoot
 Behind the first vertex any segment may step: what a mirror shows, the shadow on it (a shadow ray towards a point of
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
-outlines, creases, curves along which surfaces cut (both sides a little off them, `chain_outline.beside_cut`), shading
+outlines, creases, curves along which surfaces cut (both sides a little off them, `chain_beside`), shading
 outlines and patterns. Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments, and the steps that
 lights bring along. With light subpaths, what points send to the film by way of mirrors and glass steps as well, and is
 searched from the light's side (`light_chain`).
@@ -45,7 +45,8 @@ from ..plan.reasons import steps_rest
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from . import light_chain
-from .chain_crossing import adjoint_of_speed, beside_curve, crossings, sampled_as_edge, step_per_slope
+from .chain_beside import beside_curve
+from .chain_crossing import adjoint_of_speed, crossings, sampled_as_edge, step_per_slope
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import Lines
 from .chain_outline import Curve
@@ -145,7 +146,7 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     line = lines.line(found.at.sample)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
-    pair = beside_curve(lines, pair, curve)
+    pair = beside_curve(job.scene, lines.world.patterns, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
     end = End(pair.sight, curve, pair.in_light, pair.light, source, distance)
 

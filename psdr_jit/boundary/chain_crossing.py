@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..core.ad import backpropagate, tangents
 from ..core.records import Hit
-from .chain_outline import Curve, beside_cut, beside_line, crossed_curve
+from .chain_outline import Curve, crossed_curve
 from .chain_patterns import NO_FAMILY
 from .chain_sweeps import AtRest, slope_at_end
 from .chain_trace import ChainRecords, Pair
@@ -50,13 +50,6 @@ def starts_behind(pair: Pair) -> mi.Bool:
     si = met.interaction(asked, mi.RayFlags.Minimal)
     behind = dr.dot(si.n, si.p - other.o) * dr.dot(si.n, met.d) <= 0
     return asked & si.shape.is_mesh() & behind
-
-
-def beside_curve(lines: SearchedLines, pair: Pair, curve: Curve) -> Pair:
-    """The last segments clear of a crossed line of a pattern, or of a cut; others as they are."""
-    if lines.world.patterns is not None:
-        pair = beside_line(lines.job.scene, pair, curve)
-    return beside_cut(lines.job.scene, pair, curve)
 
 
 def sampled_as_edge(pair: Pair, sight: Hit) -> mi.Bool:

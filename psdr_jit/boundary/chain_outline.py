@@ -18,20 +18,19 @@ seen from the other side of its shading normal, has a shading outline there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
 from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
-from ..edges.points import LEAST_SLANT, clear_of_lift
 from ..paths.delta_step import delta_step
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
 from ..scene.registry import registry_values
-from .chain_patterns import INSET, NO_FAMILY, ChainPatterns
+from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
@@ -164,7 +163,7 @@ def _closer(a: Outline, b: Outline) -> Outline:
     return dr.select(dr.abs(b.gap) < dr.abs(a.gap), b, a)
 
 
-def _edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
+def edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
     """The side of the triangle at the end of `hit`, which it meets at `p`, that `line` passes closest by."""
     on_mesh, x = triangle(hit, mi.Bool(True))
     best = Outline(_resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
@@ -201,7 +200,7 @@ def _analytic_outline(shapes: AnalyticShapes, hit: Hit, p: mi.Point3f, line: mi.
 
 
 def _outline(shapes: AnalyticShapes | None, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
-    edge = _edge_outline(hit, p, line)
+    edge = edge_outline(hit, p, line)
     return edge if shapes is None else _closer(edge, _analytic_outline(shapes, hit, p, line))
 
 
@@ -254,40 +253,3 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
         F=F,
         valid=dr.isfinite(F),
     )
-
-
-def beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
-    """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
-    si = pair.a.interaction(curve.pattern)
-    across = curve.g * (INSET / dr.squared_norm(curve.g))
-    step = si.dp_du * across.x + si.dp_dv * across.y
-    crossed = curve.pattern & dr.all(dr.isfinite(step))
-
-    return _moved(scene, pair, curve.side * step, crossed)
-
-
-def beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
-    """Where surfaces cut: both last segments moved off the curve, in parallel, until rounding no longer decides.
-
-    Rays that leave a surface start off it, and a point beside a cut is known to a few units in the last place: closer
-    to the curve, what is behind the other surface may be taken for what is in front. A segment whose own surface is the
-    one in front on the positive side, the larger n_i·n/(n_i·d), is moved along n = c_1 + c_2.
-    """
-    n = mi.Vector3f(curve.c1 + curve.c2)
-    crossed = curve.cut & ~pair.in_light & dr.isfinite(curve.side)
-    n_a, n_b = (hit.interaction().n for hit in (pair.a, pair.b))
-    cot = dr.abs(dr.dot(n_a, n_b)) / dr.maximum(dr.norm(dr.cross(n_a, n_b)), LEAST_SLANT)
-    x = curve.line.o + curve.t * curve.line.d
-    return _moved(scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
-
-
-def _moved(scene: mi.Scene, pair: Pair, step: mi.Vector3f, crossed: mi.Bool) -> Pair:
-    """The last segments shifted by ±`step`, where they still end on the same shapes."""
-
-    def moved(hit: Hit, step: mi.Vector3f) -> Hit:
-        # From half of the way: beside its start there may be the surface that it has left.
-        ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + step, hit.d)
-        there = Hit.of(ray, scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
-        return dr.select(crossed & (there.shape == hit.shape), there, hit)
-
-    return replace(pair, a=moved(pair.a, step), b=moved(pair.b, -step))

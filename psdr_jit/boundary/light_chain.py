@@ -22,7 +22,7 @@ For the surface that ends in the edge itself, F_θ = 0: its material does not pa
 other side, light that something comes in between of, or no longer does.
 
 Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts into what it
-shines on, both sides are looked at a little off the cut (`chain_outline.beside_cut`).
+shines on, both sides are looked at a little off the cut (`chain_beside`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ from ..paths.light_walk import take_up
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
-from .chain_crossing import adjoint_of_speed, beside_curve, crossings, step_per_slope
+from .chain_beside import beside_curve
+from .chain_crossing import adjoint_of_speed, crossings, step_per_slope
 from .chain_fixed import Directions
 from .chain_outline import Curve
 from .chain_search import find_crossings
@@ -155,7 +156,7 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     Φ = _intensity(line, line.direction(p), wavelengths) * weight
     ends = pair.a, pair.b
-    pair = beside_curve(lines, pair, curve)
+    pair = beside_curve(job.scene, lines.world.patterns, pair, curve)
     view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
     end = _end(job, pair, curve, view, aperture)
 

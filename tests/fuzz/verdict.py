@@ -3,8 +3,12 @@
 The first look is cheap. What it suspects is looked at again with independent seeds, more of them, and a smaller step,
 and once more with a still smaller one, at which what was off must have shrunk, too. Only what is off then counts: a
 hundred seeds with some forty comparisons each give no false alarm, nor does what differences leave out between their
-steps. Where the image has a kink at the scene as it is (surfaces that touch, a corner that appears), the differences to
-either side disagree however small the step is: there is no derivative to be wrong about.
+steps.
+The smaller the step, the rarer the paths that it changes: those behind a mask that meet a small lamp by chance,
+say, and differences that have not met any look certain. A last look takes a larger step, and must find it off as well.
+
+Where the image has a kink at the scene as it is (surfaces that touch, a corner that appears), the differences to either
+side disagree however small the step is: there is no derivative to be wrong about.
 """
 
 from __future__ import annotations
@@ -36,6 +40,7 @@ BLOCK = 4  # [px]
 KNOWN_ENOUGH = 0.1  # standard error of a gain that could still tell half of the derivative from all of it
 GROUPS = 32  # of seeds, from whose scatter errors are measured
 FINER = 3.0  # by how much each further look's step is smaller
+COARSER = 5.0  # by how much the last look's step is larger than the first's
 STEP_SHARE = 0.5  # of what was off, at most left by a third look that believes the step to be the cause
 KINK_SHARE = 0.5  # of the differences' asymmetry that a smaller step must leave; that of a smooth image goes with it
 
@@ -55,6 +60,7 @@ class Effort:
 FIRST = Effort(seeds=8, spp=128, reference_spp=512, doublings=3, precision=0.02, first_seed=0)
 SECOND = Effort(seeds=16, spp=256, reference_spp=1024, doublings=4, precision=0.006, first_seed=1000)
 THIRD = replace(SECOND, doublings=5, first_seed=5000)
+LAST = replace(SECOND, reference_spp=8192, first_seed=9000)
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,9 @@ def _examine(case: Mapping[str, Any], first: Effort, *others: Effort) -> tuple[s
         if not look.wrong and look.off < STEP_SHARE * suspected:
             return RIGHT, f"{look}, after {before}"
         before, suspected = f"{look}, after {before}", look.off
+    coarse = compare(motion, case, LAST, 1 / COARSER)
+    if not coarse.wrong:
+        return NOISY, f"by a larger step {coarse}, after {before}"
     share = asymmetry(motion, case, others[0])
     word = KINK if share > KINK_SHARE else WRONG
     return word, f"{before}; a smaller step leaves {share:.2f} of the differences' asymmetry"

@@ -41,3 +41,11 @@ def test_no_light_leaks_through_sharp_edges(llvm, angle):
     chain, whole = (forward(motion, {**spec, **budgets}, 2, 64) for budgets in ({**ALONE, "spps": 64}, {}))
     assert np.abs(whole).max() > 1, "nothing to be seen that could be wrong"
     assert np.abs(chain).max() < 1e-3 * np.abs(whole).max()
+
+
+def test_every_direction_of_a_constant_sky_is_alike_in_a_wedge(llvm):
+    """Paths of any length bring the same light from everywhere, so nothing steps; leaks past the sharp edge would."""
+    motion = perturb(scene(40.0), "wedge.vertex_positions", (1, 0.3, 0.2))
+    spec = {"type": "psdr_path", "form": "spatial", "rr_depth": 1000, **ALONE, "spps": 64}
+    cut_short, whole = (forward(motion, {**spec, "max_depth": depth}, 8, 64) for depth in (3, 20))
+    assert abs(whole.sum()) < 0.1 * abs(cut_short.sum()), "leaks brought half of it"

@@ -1,0 +1,123 @@
+"""Both sides of a crossed curve are looked at a little off it: where rounding, and the height at which rays start,
+no longer decide what they see.
+
+Rays that Mitsuba starts leave their surface at a small height. Beside a line of a pattern and a curve along which
+surfaces cut, and inside of an edge sharper than a right angle, that height is more than there is room for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.records import Hit
+from ..edges.points import LEAST_SLANT, clear_of_lift
+from .chain_outline import Curve, edge_outline, triangle
+from .chain_patterns import INSET, ChainPatterns
+from .chain_trace import Pair
+
+#: How far from an edge, as a share of its distance from the face's centroid, the other face is looked for, ...
+PROBE = 0.1
+
+#: ... from this height above or below the face, as a share of that.
+PROBE_HEIGHT = 0.01
+
+#: Largest sine of the angle to its face at which an edge is thought to belong to it.
+SAME_EDGE = 0.02
+
+
+def beside_curve(scene: mi.Scene, patterns: ChainPatterns | None, pair: Pair, curve: Curve) -> Pair:
+    """The last segments clear of a crossed line of a pattern, of a cut, or of a sharp edge; others as they are."""
+    if patterns is not None:
+        pair = _beside_line(scene, pair, curve)
+    return _beside_sharp_edges(scene, _beside_cut(scene, pair, curve))
+
+
+def _beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+    """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
+    si = pair.a.interaction(curve.pattern)
+    across = curve.g * (INSET / dr.squared_norm(curve.g))
+    step = si.dp_du * across.x + si.dp_dv * across.y
+    crossed = curve.pattern & dr.all(dr.isfinite(step))
+
+    return _both_moved(scene, pair, curve.side * step, crossed)
+
+
+def _beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+    """Where surfaces cut: both last segments moved off the curve, in parallel, until rounding no longer decides.
+
+    Rays that leave a surface start off it, and a point beside a cut is known to a few units in the last place: closer
+    to the curve, what is behind the other surface may be taken for what is in front. A segment whose own surface is the
+    one in front on the positive side, the larger n_i·n/(n_i·d), is moved along n = c_1 + c_2.
+    """
+    n = mi.Vector3f(curve.c1 + curve.c2)
+    crossed = curve.cut & ~pair.in_light & dr.isfinite(curve.side)
+    n_a, n_b = (hit.interaction().n for hit in (pair.a, pair.b))
+    cot = dr.abs(dr.dot(n_a, n_b)) / dr.maximum(dr.norm(dr.cross(n_a, n_b)), LEAST_SLANT)
+    x = curve.line.o + curve.t * curve.line.d
+    return _both_moved(scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
+
+
+def _beside_sharp_edges(scene: mi.Scene, pair: Pair) -> Pair:
+    """Of a mesh's edge sharper than a right angle: last segments moved along their faces until rays start inside.
+
+    A ray that starts a height h off a face, at less than h cot φ from an edge where another face meets it at the angle
+    φ, starts behind that one (`edges.points.face_inset`).
+    """
+    return replace(
+        pair,
+        a=dr.select(pair.in_light, pair.a, _clear_of_edge(scene, pair.a, ~pair.in_light)),
+        b=dr.select(pair.in_light, pair.b, _clear_of_edge(scene, pair.b, ~pair.in_light)),
+    )
+
+
+def _clear_of_edge(scene: mi.Scene, hit: Hit, active: mi.Bool) -> Hit:
+    """The segment, moved in parallel into the triangle that it ends on, if it ends too near to a sharp edge of that."""
+    line = mi.Ray3f(hit.o, hit.d)
+    on_mesh, corners = triangle(hit, active)
+    p = line(dr.select(on_mesh, hit.t, 0))
+    edge = edge_outline(hit, p, line)
+    m = edge.m.o
+    n_face = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+    inward = mi.Vector3f((corners[0] + corners[1] + corners[2]) / 3 - m)
+    τ = dr.normalize(dr.cross(n_face, edge.n))
+    inward -= τ * dr.dot(τ, inward)
+    depth = dr.norm(inward)
+    inward /= depth
+    cot = dr.maximum(*(_cot_to_other(scene, m, (inward, τ, side * n_face), depth, on_mesh) for side in (-1, 1)))
+    needed = clear_of_lift(m) * cot
+    slant = dr.dot(inward, edge.n)
+    near = on_mesh & (dr.abs(edge.gap) < needed * dr.abs(slant)) & (needed < depth)
+    return _moved(scene, hit, edge.n * (needed * slant), near)
+
+
+def _cot_to_other(scene: mi.Scene, m: mi.Point3f, frame: tuple, depth: mi.Float, active: mi.Bool) -> mi.Float:
+    """cot φ of the face that meets a face's edge at `m`, on the side of its normal; 0: none does in less than 90°.
+
+    `frame`: unit vectors, into the face across the edge, along the edge, and the normal.
+    """
+    inward, τ, n = frame
+    s = PROBE * depth
+    ray = mi.Ray3f(m + s * (inward + PROBE_HEIGHT * n), n, maxt=s / LEAST_SLANT, time=0, wavelengths=mi.Color0f())
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    met = active & pi.is_valid() & pi.shape.is_mesh()
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, met)
+    away = dr.normalize(si.p - m)
+    met &= (dr.abs(dr.dot(si.n, away)) < SAME_EDGE) & (dr.abs(dr.dot(si.n, τ)) < SAME_EDGE)
+    height = PROBE_HEIGHT * s + pi.t
+    return dr.select(met, s / height, 0)
+
+
+def _both_moved(scene: mi.Scene, pair: Pair, step: mi.Vector3f, crossed: mi.Bool) -> Pair:
+    """The last segments shifted by ±`step`."""
+    return replace(pair, a=_moved(scene, pair.a, step, crossed), b=_moved(scene, pair.b, -step, crossed))
+
+
+def _moved(scene: mi.Scene, hit: Hit, step: mi.Vector3f, crossed: mi.Bool) -> Hit:
+    """A segment shifted by `step`, where it still ends on the same shape."""
+    # From half of the way: beside its start there may be the surface that it has left.
+    ray = mi.Ray3f(hit.o + 0.5 * hit.t * hit.d + step, hit.d)
+    there = Hit.of(ray, scene.ray_intersect_preliminary(ray, coherent=False, active=crossed))
+    return dr.select(crossed & (there.shape == hit.shape), there, hit)
