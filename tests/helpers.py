@@ -57,12 +57,12 @@ def images(scene: mi.Scene, spec: dict, spp: int, seeds: int, first: int = 0) ->
     return np.stack([integrator_specs.to_image(image) for image in rendered])
 
 
-def mesh_of(points: np.ndarray, faces: np.ndarray, **props) -> mi.Mesh:
-    """A mesh named "shape" with properties such as its BSDF."""
+def mesh_of(points: np.ndarray, faces: np.ndarray, normals: bool = False, **props) -> mi.Mesh:
+    """A mesh named "shape" with properties such as its BSDF; Mitsuba computes its `normals`, if any."""
     given = mi.Properties()
     for name, value in props.items():
         given[name] = mi.load_dict(value) if isinstance(value, dict) else value
-    mesh = mi.Mesh("shape", len(points), len(faces), props=given)
+    mesh = mi.Mesh("shape", len(points), len(faces), has_vertex_normals=normals, props=given)
     params = mi.traverse(mesh)
     params["vertex_positions"] = points.ravel().astype(np.float32)
     params["faces"] = faces.ravel().astype(np.uint32)

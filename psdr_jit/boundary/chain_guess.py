@@ -73,7 +73,7 @@ class Guesses:
     def where(self, pair: Pair, active: mi.Bool) -> mi.Float:
         """Share of the way from a to b, or `NOWHERE`. Detached."""
         active = active & ~pair.chosen
-        outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon
+        outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon & ~pair.turned
         first = pair.a.intersection().t <= pair.b.intersection().t
         near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
         of_near, of_far = (triangle(hit, outlined) for hit in (near, far))

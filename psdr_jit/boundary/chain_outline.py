@@ -39,6 +39,9 @@ TOUCHING = 1e-3
 #: How much closer the edge of the farther surface, and a cut, must be passed by to be preferred.
 FARTHER, CUT = 2.0, 4.0
 
+#: Difference of shading normals below which two faces of a mesh that touch share an edge: they do not cut there.
+ONE_SHADING = 1e-2
+
 #: Corners of a triangle in barycentric coordinates of its hits.
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 
@@ -222,7 +225,8 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
     t = dr.dot(si_near.p - line.o, line.d)
     x = line.o + t * line.d
     F_cut = (dr.dot(c1, x - si_near.p) + dr.dot(c2, x - si_far.p)) * scale
-    cut = touching & dr.isfinite(scale) & (CUT * dr.abs(F_cut) < dr.abs(best.gap))
+    folded = (near.shape == far.shape) & (dr.norm(si_near.sh_frame.n - si_far.sh_frame.n) < ONE_SHADING)
+    cut = touching & ~folded & dr.isfinite(scale) & (CUT * dr.abs(F_cut) < dr.abs(best.gap))
 
     h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
     shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)

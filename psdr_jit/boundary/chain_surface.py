@@ -5,6 +5,9 @@ shading normal, unless one point lies far off the other's tangent plane for thei
 itself) or their normals differ (a crease), which spheres, cylinders and single triangles know nothing of. Such a guess
 may be wrong for rays that are far apart, which costs time, and is right for those close by, which is what counts.
 
+What particles carry on from faces with interpolated normals steps between these by Veach's correction, which knows
+of the faces (`folds`), though what is seen does not.
+
 Where normals are interpolated, a direction ω may lead away from the surface by the shading normal n_s, and under it by
 the face's normal n. Such a path goes on behind the surface that it is reflected by. Where that begins, at n·ω = 0 or on
 the edge to a face that is tilted otherwise, what is seen steps: a horizon of the face.
@@ -30,6 +33,9 @@ ROUND = ("sphere", "cylinder")
 #: of the normals from which on they count as apart.
 STEP_SLOPE, STEP_NORMAL = 0.25, 0.3
 
+#: Length of the difference of unit normals up to which faces are one plane: a few times their rounding.
+ONE_NORMAL = 2e-6
+
 #: No guess of where chains part.
 NOWHERE = -1.0
 
@@ -41,6 +47,7 @@ class ChainSurfaces:
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
     round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
     horizons: bool  # are there shading normals?
+    folds: bool = False  # do paths part, too, on edges between faces across which normals are interpolated?
 
     @staticmethod
     def of(job: Job) -> ChainSurfaces:
@@ -50,12 +57,19 @@ class ChainSurfaces:
         tables = (registry_table(job.scene, indices) for indices in (flat, bulging))
         return ChainSurfaces(*tables, any(s.smooth for s in shapes))
 
-    def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f) -> mi.Bool:
-        """Do two rays of directions d end on one surface, or both escape? `a`, `b`: surface interactions."""
+    def is_flat(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Bool:
+        """Is it a point of a shape whose faces are shaded as planes?"""
+        index = dr.select(active & si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0)
+        return dr.gather(mi.UInt32, self.flat, index) != 0
+
+    def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f, k: mi.UInt32) -> mi.Bool:
+        """Do two rays of directions d, segments `k` of their paths, end on one surface, or both escape? `a`, `b`:
+        surface interactions.
+        """
         both = a.is_valid() & b.is_valid()
         same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
         index = dr.select(both & same, dr.reinterpret_array(mi.UInt32, a.shape), 0)
-        flat = dr.gather(mi.UInt32, self.flat, index) != 0
+        flat = self.is_flat(a, both & same)
         offset = b.p - a.p
         side = dr.dot(a.n, d_a) * dr.dot(b.n, d_b) > 0
         near = COPLANAR_OFFSET * (a.t + b.t)
@@ -66,6 +80,8 @@ class ChainSurfaces:
         shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
         close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
         one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
+        if self.folds:
+            close &= (k == 0) | ~a.shape.is_mesh() | (dr.norm(a.n - b.n) < ONE_NORMAL)
         one_curve = side & shaded & (one_face | close | (dr.gather(mi.UInt32, self.round, index) != 0))
         return same & (~both | dr.select(flat, one_plane & side, one_curve))
 

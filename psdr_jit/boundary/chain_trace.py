@@ -95,6 +95,7 @@ class Pair:
     seen: mi.Bool  # it is the first that sees it
     horizon: mi.Bool  # they part as they leave what segment k − 1 ends at, ...
     one_face: mi.Bool  # ... and that is one face, not the edge between two
+    turned: mi.Bool  # they part where the shading normal at the end of segment k turns away from the sensor
     family: mi.UInt32  # of lines on the surface, between which they part; `chain_patterns.NO_FAMILY`: they do not
     where: mi.Float  # between the chains that line lies: share of the way from a to b, roughly
     lamp: mi.Float  # where between them a lamp may hide, likewise, ...
@@ -108,12 +109,14 @@ class Pair:
     @staticmethod
     def start() -> Pair:
         """No two of its arrays may be one object: loops change them in place."""
-        differs, specular, chosen, moves, in_light, seen, horizon, one_face = (mi.Bool(False) for _ in range(8))
+        differs, specular, chosen, moves, in_light, seen = (mi.Bool(False) for _ in range(6))
+        horizon, one_face, turned = (mi.Bool(False) for _ in range(3))
         light = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(0), mi.Float(0))
         a, b = (Hit.made(dr.zeros, 1) for _ in range(2))
         where, lamp, miss = mi.Float(0.5), mi.Float(0.5), mi.Float(dr.inf)
+        family, β_a, β_b = mi.UInt32(NO_FAMILY), mi.Spectrum(1), mi.Spectrum(1)
         return Pair(mi.UInt32(0), differs, specular, chosen, moves, mi.Bool(True), in_light, seen, horizon, one_face,
-                    mi.UInt32(NO_FAMILY), where, lamp, miss, light, a, b, mi.Spectrum(1), mi.Spectrum(1))  # fmt: skip
+                    turned, family, where, lamp, miss, light, a, b, β_a, β_b)  # fmt: skip
 
     @property
     def last(self) -> mi.UInt32:
@@ -204,7 +207,7 @@ def trace_pair(
         pair.a, pair.b = Hit.of(ray_a, pi_a), Hit.of(ray_b, pi_b)
         if dr.hint(store is not None, mode="scalar"):
             store.write(pair.k, pair.a, active)
-        pair.differs = ~world.surfaces.same(a, b, ray_a.d, ray_b.d)
+        pair.differs = ~world.surfaces.same(a, b, ray_a.d, ray_b.d, pair.k)
         pair.horizon &= pair.differs
         if dr.hint(world.patterns is not None, mode="scalar"):
             guessed = active & ~pair.horizon

@@ -8,7 +8,8 @@ The interior term follows such light from its side (`interior/light_borne.py`): 
 Φ the light's intensity [W/sr], or the irradiance of a directional light, of which q is a place on a disk across its
 rays and dω its area; w_k lobe by lobe, and at y_s the BSDF over the area that a pixel sees. The first
 vertex y_1 stays on its surface, so q moves with it. g steps where two neighbouring paths part: where one goes past
-an edge, or where the sensor sees one of the two ends y_s only. Along a line X across q the crossed curve is met where
+an edge, where the sensor sees one of the two ends y_s only, or where it sees them from different sides of their shading
+normals. Along a line X across q the crossed curve is met where
 F(X, θ) = 0, as seen by lines of the camera (`chain.py`). Then, with F_θ the derivative of F along the flow, y_1 fixed,
 
     dI ∋ (g_a − g_b) · (Ẋ − q̇),        Ẋ − q̇ = −F_θ/F_X,        a before b along the line,
@@ -71,6 +72,8 @@ class LightEnd:
     segment: mi.UInt32  # its number
     curve: Curve
     to_sensor: mi.Bool  # it is one of the sensor, from behind
+    turned: mi.Bool  # where it ends, the shading normal turns away from the sensor
+    view: mi.Vector3f  # the direction in which the sensor sees its end
     film: mi.Point2f  # where it lands, in [0, 1]² of the crop window
     aperture: mi.Point2f
     lens: mi.Point3f  # the point that it comes from; of an orthographic sensor, unused
@@ -86,8 +89,22 @@ class LightEnd:
             turn = -moving.of_view(self.film, self.aperture, -line.d)
             aimed += dr.select(near, shift / self.distance, turn)
         aimed -= (o - dr.detach(o)) / self.distance
-        d = dr.select(self.to_sensor, dr.normalize(aimed), d)
-        return self.curve.attached_F(o, d, moving, facts)
+        F = self.curve.attached_F(o, dr.select(self.to_sensor, dr.normalize(aimed), d), moving, facts)
+        return dr.select(self.turned, self._attached_cosine(o, d, moving, facts), F)
+
+    def _attached_cosine(
+        self, o: mi.Point3f, d: mi.Vector3f, moving: Displacements, facts: SceneFacts
+    ) -> mi.Float | float:
+        """F of the end's shading outline: the cosine at which the sensor sees it. Attached."""
+        if not any(s.smooth for s in facts.shapes):
+            return 0.0
+        si = moving.surface(self.curve.line, mi.Ray3f(o, d), mi.RayFlags.All)
+        shift, turn = mi.Vector3f(0), mi.Vector3f(0)
+        if facts.camera_moves:
+            shift = moving.of_camera(self.film, self.aperture, self.lens)
+            turn = moving.of_view(self.film, self.aperture, self.view)
+        near = dr.isfinite(self.distance)
+        return dr.dot(si.sh_frame.n, dr.select(near, dr.normalize(si.p - (self.lens + shift)), self.view + turn))
 
 
 @dataclass
@@ -128,20 +145,20 @@ def _sent_on(job: Job, pair: Pair, side: int, Φ: mi.Spectrum, wavelengths) -> t
     """
     hit, β = (pair.b, pair.β_b) if side else (pair.a, pair.β_a)
     rng = lane_sampler(stream_seed(job.seed, Stream.CHAIN_RADIANCE), dr.arange(mi.UInt32, dr.width(pair.k)))
-    β = dr.select(pair.in_light | (pair.k >= job.light.longest), 0, Φ * β)
+    β = dr.select(pair.in_light | pair.turned | (pair.k >= job.light.longest), 0, Φ * β)
     limits = replace(job.limits, light=job.light)
     path = take_up(job.scene, rng, hit, β, pair.k, wavelengths, limits, job.options.hide_emitters)
     return path.p, dr.select(path.count > 0, path.value, 0)
 
 
-def _connected(job: Job, pair: Pair, chain: ChainRecords, Φ: mi.Spectrum, wavelengths):
-    """Of vertices that the sensor sees on one side only: `(where that lands, g if seen, view, lens point)`."""
-    hit = chain.segment(pair.k, pair.in_light)
+def _connected(job: Job, pair: Pair, hit: Hit, Φβ: mi.Spectrum, wavelengths):
+    """The end of `hit`, where paths part in what the sensor sees: `(view, lens point, g if it is seen)`."""
+    active = pair.in_light | pair.turned
     ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
-    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
+    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, active)
     view, aperture = sensor_view(job.frame, si.p, pair.light.u)
-    f = particle_eval(si, si.bsdf(), -view.ω, pair.in_light)
-    return view, aperture, dr.select(pair.in_light, Φ * pair.β_a * f / view.J_px, 0)
+    f = particle_eval(si, si.bsdf(), -view.ω, active)
+    return view, aperture, dr.select(active, Φβ * f / view.J_px, 0)
 
 
 def _steps(lines: LightLines | None) -> LightSteps | None:
@@ -157,20 +174,26 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     Φ = _intensity(line, line.direction(p), wavelengths) * weight
     ends = pair.a, pair.b
     pair = beside_curve(job.scene, lines.world.patterns, pair, curve)
-    view, aperture, at_end = _connected(job, pair, chain, Φ, wavelengths)
-    end = _end(job, pair, curve, view, aperture)
+    shared = chain.segment(pair.k, pair.in_light)
+    connected = [
+        _connected(job, pair, dr.select(pair.in_light, shared, hit), Φ * β, wavelengths)
+        for hit, β in ((pair.a, pair.β_a), (pair.b, pair.β_b))
+    ]
+    end = _end(job, pair, curve, *connected[0][:2])
 
     valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: (line.origin(q), line.direction(q)))
     per_F = dr.select(valid, step * lines.measure(line, p), 0)
     sides, worth, weight = [], mi.Float(0), found.at.weight / line.across
     for i, hit in enumerate(ends):
         landed, g = _sent_on(job, pair, i, Φ, wavelengths)
-        g += dr.select(pair.seen ^ mi.Bool(i == 1), at_end, 0)
+        view, _, at_end = connected[i]
+        g += dr.select(pair.turned | (pair.seen ^ mi.Bool(i == 1)), at_end, 0)
         value = job.call.counters.rejected.keep_finite(g * dr.select(mi.Bool(i == 1), -per_F, per_F))
         worth += dr.max(dr.abs(value))
         value *= weight
         first = dr.select(pair.k == 0, hit, chain.segment(mi.UInt32(0), mi.Bool(True)))
-        sides.append(Side(first, line.emitter, dr.select(pair.in_light, view.p, landed), value, dr.any(value != 0)))
+        landed = dr.select(pair.in_light | pair.turned, view.p, landed)
+        sides.append(Side(first, line.emitter, landed, value, dr.any(value != 0)))
     steps = LightSteps(chain, end, tuple(sides), wavelengths, line.place, worth)
     dr.eval(end, sides, wavelengths, steps.place, worth)
     return steps
@@ -183,7 +206,24 @@ def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> Ligh
     if frame.kind != "orthographic":
         lens = frame.to_world @ lens_point(frame, aperture)
         distance = dr.norm(lens - curve.line.o)
-    return LightEnd(pair.sight, curve, pair.in_light, view.film, aperture, lens, distance)
+    si = curve.line.interaction(pair.turned)
+    cos = dr.dot(si.sh_frame.n, view.ω)
+    curve = replace(
+        curve,
+        F=dr.select(pair.turned, cos, curve.F),
+        valid=dr.select(pair.turned, dr.isfinite(cos), curve.valid),
+    )
+    return LightEnd(
+        segment=pair.sight,
+        curve=curve,
+        to_sensor=pair.in_light,
+        turned=pair.turned,
+        view=view.ω,
+        film=view.film,
+        aperture=aperture,
+        lens=lens,
+        distance=distance,
+    )
 
 
 def _leave(moving: Displacements, side: Side) -> tuple[mi.Vector3f, mi.Vector3f]:

@@ -130,6 +130,7 @@ def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
     return replace(
         world,
         depth=min(technique.longest + 1, CHAIN_DEPTH),
+        surfaces=replace(world.surfaces, folds=world.surfaces.horizons),
         camera=varying(mi.Bool, job.facts.emitters_move),
         lights=varying(mi.Bool, job.facts.camera_moves),
         connects=partial(compare_sensor, technique, job.options.hide_emitters),
@@ -241,7 +242,9 @@ def compare_sensor(
     u: Numbers,
     active: mi.Bool,
 ) -> Pair:
-    """Does the sensor see both of the surface interactions `ends`, or one of them? The film's own border is none."""
+    """Does the sensor see both of the surface interactions `ends`, or one of them? And both from the same side of their
+    shading normals? The film's own border is no step.
+    """
     a, b = ends
     active = active & mi.has_flag(a.bsdf().flags(), mi.BSDFFlags.Smooth)
     views = [sensor_view(technique.frame, si.p, u.light)[0] for si in ends]
@@ -250,14 +253,18 @@ def compare_sensor(
     hit_a, hit_b = (_towards_sensor(world, si, view, hide_emitters, active) for si, view in zip(ends, views))
     seen_a, seen_b = hit_a.shape == 0, hit_b.shape == 0
     parts = active & (seen_a != seen_b)
+    h_a, h_b = (dr.dot(si.sh_frame.n, view.ω) for si, view in zip(ends, views, strict=True))
+    turned = active & seen_a & seen_b & (h_a * h_b < 0) & ~world.surfaces.is_flat(a)
     there = LightPoint(mi.UInt32(0), mi.Point3f(0), mi.Point2f(u.light), mi.Float(1))
     return replace(
         pair,
-        differs=pair.differs | parts,
-        moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))),
+        differs=pair.differs | parts | turned,
+        moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))) | (turned & world.lights),
         in_light=parts,
+        turned=turned,
+        where=dr.select(turned, h_a / (h_a - h_b), pair.where),
         seen=seen_a,
-        light=dr.select(parts, there, pair.light),
+        light=dr.select(parts | turned, there, pair.light),
         a=dr.select(parts, hit_a, pair.a),
         b=dr.select(parts, hit_b, pair.b),
     )
