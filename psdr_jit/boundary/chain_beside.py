@@ -32,7 +32,9 @@ def beside_curve(scene: mi.Scene, patterns: ChainPatterns | None, pair: Pair, cu
     """The last segments clear of a crossed line of a pattern, of a cut, or of a sharp edge; others as they are."""
     if patterns is not None:
         pair = _beside_line(scene, pair, curve)
-    return _beside_sharp_edges(scene, _beside_cut(scene, pair, curve))
+    pair = _beside_sharp_edges(scene, _beside_cut(scene, pair, curve))
+    dr.eval(pair)  # in one kernel: what follows is asked for one by one
+    return pair
 
 
 def _beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:

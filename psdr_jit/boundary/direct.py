@@ -52,6 +52,7 @@ from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
 from .light_lines import LightLine, sample_light_lines
+from .light_steps import BORNE
 from .light_steps import ESTIMATOR as LIGHT_STEPS
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, longest_from_light, subpaths
@@ -221,6 +222,8 @@ SHADOWS = SecondaryTerm(
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
     others = [LIGHT_STEPS, SHADOWS] if job.facts.has_light_steps else [SHADOWS]
+    if job.facts.has_light_steps and job.light is not None and job.facts.has_delta_lobes:
+        others.insert(0, BORNE)
     if len(others) == 1 and not any(shape.smooth for shape in job.facts.shapes):
         return [(SHADOWS, job)]
     return shared_out(job, HORIZONS, others)

@@ -8,11 +8,14 @@ point of the sheet of such rays, the direct boundary term becomes
 
 ω from x_D to the light, ∂x/∂t along the step, v_B the velocity of the light's own space at x_D, u_D the sliding
 velocity of the receiver, W the importance at x_D. Nothing else moves: r_B = 0.
+
+Where light subpaths run, what mirrors and smooth glass send on of a point of light follows its first surface
+(`light_chain.py`): if x_D leaves it by a delta lobe, u_D is the velocity of its material, whatever moves behind it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +31,7 @@ from ..plan.job import Job
 from ..sampling.light_steps import SampledSteps, sampled_light_steps
 from ..sampling.rows import edge_samples
 from .segment_motion import BoundarySamples, SecondaryTerm
-from .sensor_subpath import Receivers, longest_from_light, subpaths
+from .sensor_subpath import Receivers, SubpathRecords, longest_from_light, subpaths
 
 
 @dataclass
@@ -91,20 +94,44 @@ def trace(job: Job, steps: SampledSteps, line: StepLine) -> StepOnReceiver | Non
 
 def evaluate(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySamples:
     """What they are worth at the sensor: their subpaths are recorded."""
+    records = _subpaths(job, found, longest_from_light(job))
+    return _samples(found, records, records.left_by_smooth_lobes(records.data.W))
+
+
+def evaluate_borne(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySamples:
+    """The same of light that x_D sends on by a delta lobe."""
+    # in the material form all of the motion is left with x_D
+    records = _subpaths(replace(job, plan=replace(job.plan, form="material")), found, _longest_borne(job))
+    return _samples(found, records, dr.select(records.by_delta_lobe(), records.data.W, 0))
+
+
+def _longest_borne(job: Job) -> int:
+    return min(longest_from_light(job), job.light.longest)
+
+
+def _subpaths(job: Job, found: StepOnReceiver, longest: int) -> SubpathRecords:
     value, still = found.value / found.pdf, mi.Vector3f(0)
     receivers = Receivers(found.lane, found.receiver, found.wavelengths, value, -found.n_perp, still)
-    records = subpaths(job, Stream.LIGHT_STEP_SUBPATH, receivers, longest_from_light(job))
+    return subpaths(job, Stream.LIGHT_STEP_SUBPATH, receivers, longest)
+
+
+def _samples(found: StepOnReceiver, records: SubpathRecords, value: mi.Spectrum) -> BoundarySamples:
     return BoundarySamples(
         at=found.at,
         ω=found.ω,
         n_perp=found.n_perp,
         wavelengths=found.wavelengths,
         records=records,
-        value=records.left_by_smooth_lobes(records.data.W),
+        value=value,
         source_motion=lambda moving: mi.Float(0),
     )
 
 
 ESTIMATOR = SecondaryTerm(
     edges=sampled_light_steps, longest=longest_from_light, sample=sample, trace=trace, evaluate=evaluate
+)
+
+#: What mirrors and smooth glass send on, where light subpaths are in the image.
+BORNE = SecondaryTerm(
+    edges=sampled_light_steps, longest=_longest_borne, sample=sample, trace=trace, evaluate=evaluate_borne
 )
