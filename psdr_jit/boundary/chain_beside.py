@@ -43,7 +43,6 @@ def _beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
     across = curve.g * (INSET / dr.squared_norm(curve.g))
     step = si.dp_du * across.x + si.dp_dv * across.y
     crossed = curve.pattern & dr.all(dr.isfinite(step))
-
     return _both_moved(scene, pair, curve.side * step, crossed)
 
 
@@ -68,11 +67,8 @@ def _beside_sharp_edges(scene: mi.Scene, pair: Pair) -> Pair:
     A ray that starts a height h off a face, at less than h cot φ from an edge where another face meets it at the angle
     φ, starts behind that one (`edges.points.face_inset`).
     """
-    return replace(
-        pair,
-        a=dr.select(pair.in_light, pair.a, _clear_of_edge(scene, pair.a, ~pair.in_light)),
-        b=dr.select(pair.in_light, pair.b, _clear_of_edge(scene, pair.b, ~pair.in_light)),
-    )
+    active = ~pair.in_light
+    return replace(pair, a=_clear_of_edge(scene, pair.a, active), b=_clear_of_edge(scene, pair.b, active))
 
 
 def _clear_of_edge(scene: mi.Scene, hit: Hit, active: mi.Bool) -> Hit:
@@ -102,7 +98,8 @@ def _cot_to_other(scene: mi.Scene, m: mi.Point3f, frame: tuple, depth: mi.Float,
     """
     inward, τ, n = frame
     s = PROBE * depth
-    ray = mi.Ray3f(m + s * (inward + PROBE_HEIGHT * n), n, maxt=s / LEAST_SLANT, time=0, wavelengths=mi.Color0f())
+    ray = mi.Ray3f(m + s * (inward + PROBE_HEIGHT * n), n)
+    ray.maxt = s / LEAST_SLANT
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     met = active & pi.is_valid() & pi.shape.is_mesh()
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, met)

@@ -59,8 +59,7 @@ class ChainSurfaces:
 
     def is_flat(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Bool:
         """Is it a point of a shape whose faces are shaded as planes?"""
-        index = dr.select(active & si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0)
-        return dr.gather(mi.UInt32, self.flat, index) != 0
+        return _listed(self.flat, si, active)
 
     def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f, k: mi.UInt32) -> mi.Bool:
         """Do two rays of directions d, segments `k` of their paths, end on one surface, or both escape? `a`, `b`:
@@ -68,7 +67,6 @@ class ChainSurfaces:
         """
         both = a.is_valid() & b.is_valid()
         same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
-        index = dr.select(both & same, dr.reinterpret_array(mi.UInt32, a.shape), 0)
         flat = self.is_flat(a, both & same)
         offset = b.p - a.p
         side = dr.dot(a.n, d_a) * dr.dot(b.n, d_b) > 0
@@ -82,8 +80,14 @@ class ChainSurfaces:
         one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
         if self.folds:
             close &= (k == 0) | ~a.shape.is_mesh() | (dr.norm(a.n - b.n) < ONE_NORMAL)
-        one_curve = side & shaded & (one_face | close | (dr.gather(mi.UInt32, self.round, index) != 0))
+        one_curve = side & shaded & (one_face | close | _listed(self.round, a, both & same))
         return same & (~both | dr.select(flat, one_plane & side, one_curve))
+
+
+def _listed(table: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> mi.Bool:
+    """Is the shape that was met marked in a table of `ChainSurfaces`?"""
+    index = dr.select(active & si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0)
+    return dr.gather(mi.UInt32, table, index) != 0
 
 
 def goes_under(si: mi.SurfaceInteraction3f, ω: mi.Vector3f) -> mi.Bool:

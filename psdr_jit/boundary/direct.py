@@ -221,9 +221,11 @@ SHADOWS = SecondaryTerm(
 
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
-    others = [LIGHT_STEPS, SHADOWS] if job.facts.has_light_steps else [SHADOWS]
-    if job.facts.has_light_steps and job.light is not None and job.facts.has_delta_lobes:
-        others.insert(0, BORNE)
+    others = [SHADOWS]
+    if job.facts.has_light_steps:
+        others.insert(0, LIGHT_STEPS)
+        if job.light is not None and job.facts.has_delta_lobes:
+            others.insert(0, BORNE)
     if len(others) == 1 and not any(shape.smooth for shape in job.facts.shapes):
         return [(SHADOWS, job)]
     return shared_out(job, HORIZONS, others)

@@ -3,8 +3,7 @@
 The first look is cheap. What it suspects is looked at again with independent seeds, more of them, and a smaller step,
 and once more with a still smaller one, at which what was off must have shrunk, too. Only what is off then counts: a
 hundred seeds with some forty comparisons each give no false alarm, nor does what differences leave out between their
-steps.
-The smaller the step, the rarer the paths that it changes: those behind a mask that meet a small lamp by chance,
+steps. The smaller the step, the rarer the paths that it changes: those behind a mask that meet a small lamp by chance,
 say, and differences that have not met any look certain. A last look takes a larger step, and must find it off as well.
 
 Where the image has a kink at the scene as it is (surfaces that touch, a corner that appears), the differences to either

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import forward, mesh_of
+from variants import activate
 
 from psdr_jit.derivative.perturbation import perturb
 
@@ -49,3 +50,10 @@ def test_every_direction_of_a_constant_sky_is_alike_in_a_wedge(llvm):
     spec = {"type": "psdr_path", "form": "spatial", "rr_depth": 1000, **ALONE, "spps": 64}
     cut_short, whole = (forward(motion, {**spec, "max_depth": depth}, 8, 64) for depth in (3, 20))
     assert abs(whole.sum()) < 0.1 * abs(cut_short.sum()), "leaks brought half of it"
+
+
+def test_a_wedge_in_spectral_rendering():
+    activate("llvm_ad_spectral")
+    motion = perturb(scene(40.0), "wedge.vertex_positions", (1, 0.3, 0.2))
+    chain = forward(motion, {"type": "psdr_path", "form": "spatial", "max_depth": 3, **ALONE, "spps": 16}, 2, 16)
+    assert np.abs(chain).max() > 1, "nothing was crossed"
