@@ -7,7 +7,8 @@ sensor, and carry the covectors a on u and b on the direction that leaves:
 
     b_in = R_ωᵀ b,        a_in = (slide)ᵀ a + (∂n/∂û)ᵀ R_nᵀ b,        b of the next vertex: b_in + r a_in
 
-with r the distance to it; at a smooth vertex directions are kept and b_in = 0. What the vertex' own motion adds is
+with r the distance to it; at a smooth vertex directions are kept and b_in = 0, but for what turns together with a
+sphere (`carried_along`). What the vertex' own motion adds is
 b·(the direction that leaves, with the arrival fixed), taken from the record (`DeltaRecords.motion`). R and ∂n/∂û are
 those of Mitsuba's own attached interactions and BSDFs.
 """
@@ -21,8 +22,10 @@ import mitsuba as mi
 
 from ..core.ad import accumulate
 from ..core.records import Hit
+from ..core.surface_code import surface_code
 from ..core.varying import varying
 from ..paths.delta_step import delta_step
+from ..paths.orbits import Orbits, ball_motion
 from ..plan.motion import Displacements
 
 
@@ -32,17 +35,20 @@ class DeltaTurn:
 
     ω_in: mi.Vector3f  # unit direction in which the vertex is reached from the sensor's side
     b: mi.Vector3f  # covector on the direction that leaves it; 0 at smooth vertices
+    q: mi.Vector3f  # covector on the centre of the sphere that it is on, if directions turn with that ...
+    s: mi.Float  # ... and on the relative change of its radius
 
 
 class DeltaRecords:
     """The turns of `lanes` subpaths, vertex-major as in `SubpathRecords`; not a PyTree, so never loop state."""
 
-    BYTES = 4 * 6  # of one vertex
+    BYTES = 4 * 10  # of one vertex
 
     def __init__(self, lanes: int, depth: int):
         size = lanes * depth
         self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
-        self.turns = DeltaTurn(dr.zeros(mi.Vector3f, size), dr.zeros(mi.Vector3f, size))
+        zeros = [dr.zeros(mi.Vector3f, size) for _ in range(3)]
+        self.turns = DeltaTurn(*zeros, dr.zeros(mi.Float, size))
         self.leaves = dr.zeros(mi.Bool, lanes)  # by lane: does the path leave its first vertex by a delta lobe?
         self.mirrored = dr.zeros(mi.Bool, lanes)  # by one that reflects?
         dr.make_opaque(self.turns, self.leaves, self.mirrored)
@@ -53,6 +59,13 @@ class DeltaRecords:
         first = active & (k == 0)
         dr.scatter(self.leaves, delta, self.lane, first, mode=dr.ReduceMode.Permute)
         dr.scatter(self.mirrored, delta & ~through, self.lane, first, mode=dr.ReduceMode.Permute)
+
+    def ball_motion(self, hit: Hit, moving: Displacements, orbits: Orbits) -> mi.Float:
+        """Attached q·(centre) + s·(radius) of the spheres that the vertices `hit` are on (flat arrays)."""
+        t = self.turns
+        active = dr.any(t.q != 0) | (t.s != 0)
+        centre, radius = ball_motion(moving, dr.select(active, hit.shape, 0), *orbits.ball(hit.shape, active))
+        return dr.select(active, dr.dot(t.q, centre) + t.s * radius, 0)
 
     def motion(self, hit: Hit, moving: Displacements) -> mi.Float:
         """Attached b·(direction that leaves), the arrival fixed, of every vertex `hit` (flat arrays)."""
@@ -73,6 +86,18 @@ def lead(x: mi.Point3f) -> mi.Float:
     Mitsuba's spheres and cylinders take the motion of the *first* hit of a ray for that of any.
     """
     return mi.math.RayEpsilon * (1 + dr.max(dr.abs(x)))
+
+
+def carried_along(
+    orbits: Orbits | None, ray: mi.Ray3f, end, sphere, b: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float]:
+    """What turns the direction in which the `sphere` is seen from the `end` of `ray` (intersections), b being the
+    covector on it: `(q, s)` of its centre and radius (`paths/orbits.py`); the motion of who sees it has −q.
+    """
+    if orbits is None:
+        return mi.Vector3f(0), mi.Float(0)
+    # that end may have delta lobes, by which directions follow from the arrival
+    return orbits.seen(ray(end.t), surface_code(end), -ray.d, surface_code(sphere), active).covectors(b)
 
 
 def through_vertex(

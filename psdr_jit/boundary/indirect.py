@@ -34,7 +34,7 @@ from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.horizons import horizon_weights, sampled_horizons
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
-from . import horizons, indirect_material, segment_motion
+from . import horizons, indirect_material, indirect_orbits, segment_motion
 from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
@@ -148,12 +148,24 @@ HORIZONS = {
 }
 
 
+def _turning(part: SecondaryTerm) -> SecondaryTerm:
+    """What turns together with spheres, on the lines of a part in spatial form."""
+    return replace(
+        part,
+        trace=lambda job, edges, line: indirect_orbits.trace(job, edges, part.trace(job, edges, line)),
+        evaluate=indirect_orbits.evaluate,
+    )
+
+
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: edges, and horizons if faces are coarse."""
     edges = ESTIMATORS[job.form]
-    if not any(shape.smooth for shape in job.facts.shapes):
-        return [(edges, job)]
-    return horizons.shared_out(job, HORIZONS[job.form], [edges])
+    found = [(edges, job)]
+    if any(shape.smooth for shape in job.facts.shapes):
+        found = horizons.shared_out(job, HORIZONS[job.form], [edges])
+    if job.orbits is not None:
+        found += [(_turning(part), share) for part, share in found]
+    return found
 
 
 def forward(job: Job) -> mi.TensorXf:

@@ -78,6 +78,8 @@ def _motion(job: Job, edges: SampledRows, s: BoundarySamples, moving: Displaceme
     go_on = dr.dot(c.deposit_continue, surface)
     if s.records.delta is not None:
         go_on += s.records.delta.motion(c.hit, moving)
+        if job.orbits is not None:
+            go_on += s.records.delta.ball_motion(c.hit, moving, job.orbits)
     return _Motion(at_edge, dr.dot(c.deposit_connect, surface), go_on, camera)
 
 

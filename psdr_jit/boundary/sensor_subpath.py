@@ -36,7 +36,7 @@ from ..paths.sensor_connection import on_film, seen_by_sensor
 from ..paths.tube_surface import surface_at
 from ..plan.job import Job
 from .awaited import Awaited
-from .delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
+from .delta_adjoint import DeltaRecords, DeltaTurn, carried_along, through_vertex
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32
@@ -244,8 +244,9 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     path = PathState.start(1)
     active = mi.Bool(True)
     awaited = Awaited.of(job, receivers.waits)
+    orbits = job.orbits
     waits = mi.Bool(False) if awaited is None else mi.Bool(receivers.waits)
-    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits, awaited]):
+    while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits, awaited, orbits]):
         si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         end = _connect(job, sampler, si, bsdf, value * path.β, active)
@@ -272,20 +273,19 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
             active,
         )
         a -= g_continue
-        if records.delta is not None:
+        path, goes_on = onward.path, onward.alive & (onward.path.k <= limits.max_depth)
+        found = job.scene.ray_intersect_preliminary(following, coherent=False, active=goes_on)
+        if dr.hint(records.delta is not None, mode="scalar"):
             delta = onward.alive & onward.scattering.delta
             turned, bent = through_vertex(pi, si, bsdf, b, -following.d, -ray.d, delta)
             through = dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.sh_frame.n, following.d) > 0
-            turn = DeltaTurn(-following.d, dr.select(delta, b, 0))
-            records.delta.write(path.k - 1, turn, delta, through, active)
-            a, b = a + bent, turned
-        path = onward.path
-        ray = following
-        active = onward.alive & (path.k <= limits.max_depth)
-        pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        active &= pi.is_valid()
-        if records.delta is not None:
-            b += pi.t * a
+            a += bent
+            arriving = turned + found.t * a
+            q, s = carried_along(orbits, following, found, pi, arriving, goes_on & delta)
+            turn = DeltaTurn(-following.d, dr.select(delta, b, 0), q, s)
+            records.delta.write(path.k - 2, turn, delta, through, active)
+            a, b = a - q, arriving
+        ray, pi, active = following, found, goes_on & found.is_valid()
 
 
 def _carried_off(form: str, a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:

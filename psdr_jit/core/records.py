@@ -149,3 +149,4 @@ class Arrival:
     hit: Hit
     β: mi.Spectrum
     weight_emission: mi.Float
+    mirrored: mi.Bool  # the path leaves its first vertex by a delta lobe

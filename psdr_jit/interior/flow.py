@@ -31,6 +31,7 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
+from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
 from ..paths.recording import GRAZING, PathRecords
 from ..plan.motion import Displacements
@@ -57,6 +58,7 @@ class SceneTraits:
     tubes: Tubes | None = None  # curves
     followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
     lights_rest: bool = False  # area lights stay where they are, and as large
+    orbits: Orbits | None = None  # spheres that carry directions along (spatial flow only)
 
 
 class Flow(ABC):

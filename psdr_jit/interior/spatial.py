@@ -11,6 +11,8 @@ At a delta lobe the direction follows the arrival and the normal (`paths/delta_s
 over its probability. Emission that is met there counts where the attached ray meets it, without a measure: no emitter
 sample could have found it, and the outline of the light is a discontinuity. So does emission of lights that touch what
 they shine on, at smooth lobes (`edges/followed_lights.py`).
+
+Directions towards spheres that are mirrors or glass turn along with them (`paths/orbits.py`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
 from ..paths.delta_step import delta_step
+from ..paths.orbits import ball_motion
 from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event
@@ -47,17 +50,17 @@ class SpatialFlow(Flow):
         L += next_event(si, bsdf, vertex.nee, self.traits, moves)
 
         goes_on, inv_pdf = vertex.onward.goes_on(), vertex.onward.inv_pdf()
-        w = bsdf.eval(ctx, si, si.to_local(following.hit.d), goes_on) * inv_pdf
+        onward, stretch = self._onward(si.p, vertex, following, goes_on, moves)
+        w = bsdf.eval(ctx, si, si.to_local(onward), goes_on) * stretch * inv_pdf
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
         along = mi.Bool(False) if self.traits.followed is None else self.traits.followed.has(emitter, emits)
         _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along,
                                        self.traits.lights_rest)  # fmt: skip
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
-        onward = following.hit.d
         if self.traits.delta_lobes:
             is_delta = vertex.onward.delta
-            step = delta_step(ctx, si, bsdf, onward, is_delta)
+            step = delta_step(ctx, si, bsdf, following.hit.d, is_delta)
             onward = dr.select(is_delta, step.d, onward)
             along |= is_delta
             w, w_emission = (dr.select(is_delta, step.value * inv_pdf, smooth) for smooth in (w, w_emission))
@@ -67,3 +70,17 @@ class SpatialFlow(Flow):
             value = dr.select(along, emitter.eval(met, emits & along), value)
         L += dr.select(emits, w_emission * value * following.weight_emission, 0)
         return VertexTerms(si.p, onward, L, w)
+
+    def _onward(
+        self, x: mi.Point3f, vertex: Vertex, following: Arrival, active: mi.Bool, moves: Displacements
+    ) -> tuple[mi.Vector3f, mi.Float]:
+        """Attached direction in which the vertex x is left by a smooth lobe, and what becomes of dω: `(ω, 1)`."""
+        ω, orbits = following.hit.d, self.traits.orbits
+        if orbits is None:
+            return ω, mi.Float(1)
+        active = active & ~vertex.onward.delta & ~following.mirrored
+        sphere = orbits.seen(dr.detach(x), vertex.hit.shape, ω, following.hit.shape, active)
+        code = dr.select(sphere.holds, following.hit.shape, 0)
+        of_centre, of_radius = ball_motion(moves, code, sphere.centre, sphere.radius)
+        δ = of_centre - (x - dr.detach(x))
+        return ω + sphere.turn(δ, of_radius), 1 + sphere.stretch(δ, of_radius)

@@ -76,6 +76,7 @@ class PathRecords(Sink):
             hit=dr.gather(Hit, v.hit, index, active),
             β=dr.gather(mi.Spectrum, v.β, index, active),
             weight_emission=dr.gather(mi.Float, v.weight_emission, index, active),
+            mirrored=dr.gather(mi.Bool, v.onward.delta, self.lane, active),
         )
 
 

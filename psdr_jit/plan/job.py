@@ -17,6 +17,7 @@ from ..core.varying import varying
 from ..options import Options
 from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.light_technique import LightTechnique
+from ..paths.orbits import Orbits
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from ..scene.tubes import Tubes, tubes_of
@@ -30,6 +31,9 @@ FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
 
 #: Of one render call: the curves of its scene, in a tuple once they have been looked for.
 TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
+
+#: Of one render call: spheres that carry directions along, in a tuple once they have been looked for.
+ORBITS: Slot[tuple[Orbits | None] | None] = Slot(lambda: None)
 
 #: Of one render call: light subpaths, in a tuple once they have been asked for.
 LIGHT: Slot[tuple[LightTechnique | None] | None] = Slot(lambda: None)
@@ -114,6 +118,16 @@ class Job:
         if self.shared[CRITICAL] is None:
             self.shared[CRITICAL] = (critical_angle(self.scene),)
         return self.shared[CRITICAL][0]
+
+    @property
+    def orbits(self) -> Orbits | None:
+        """Spheres that carry directions along, read once per render call. None where light subpaths run, which keep
+        directions, and in other forms than the spatial one."""
+        if self.form != "spatial" or self.light is not None:
+            return None
+        if self.shared[ORBITS] is None:
+            self.shared[ORBITS] = (Orbits.of(self.scene, self.facts),)
+        return self.shared[ORBITS][0]
 
     def _light_technique(self) -> LightTechnique | None:
         plan = self.plan

@@ -37,6 +37,9 @@ INDIRECT_RELEVANCE = 0.05
 #: Share of a resting edge's directions in which movers are behind it, where that counts; otherwise they are in front.
 AHEAD = {Use.STEP: 0.0, Use.SHADOW: 0.0, Use.BACKGROUND: 0.5}
 
+#: The same where directions turn with what moves (`paths/orbits.py`).
+AHEAD_OF_ORBITS = 0.5
+
 #: Emitters that are looked at one by one when asking whether an edge can cast a shadow.
 MAX_EMITTERS = 16
 
@@ -46,6 +49,7 @@ class Movers:
     """Ball around everything that can move, if only shapes do, and its images in mirrors."""
 
     seen: SeenBalls
+    ahead: float  # share of a resting edge's directions in which they are behind it
 
     @property
     def in_mirrors(self) -> bool:
@@ -89,12 +93,12 @@ class RowViews(Views):
     def sample(self, w: Wedges, x: mi.Point3f, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
         if self.movers is None:
             return w.sample(u)[0]
-        return sample_view(w, self.movers.seen_from(x), self._rests(active), AHEAD[self.use], u)[0]
+        return sample_view(w, self.movers.seen_from(x), self._rests(active), self.movers.ahead, u)[0]
 
     def pdf(self, w: Wedges, x: mi.Point3f, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
         if self.movers is None:
             return w.pdf(ω)
-        return pdf_view(w, self.movers.seen_from(x), self._rests(active), AHEAD[self.use], ω)
+        return pdf_view(w, self.movers.seen_from(x), self._rests(active), self.movers.ahead, ω)
 
     def _rests(self, active: mi.Bool) -> mi.Bool:
         return dr.gather(mi.Bool, self.resting, self.row, active)
@@ -148,7 +152,9 @@ def _found_movers(job: Job, use: Use) -> Movers | None:
         return None
     shapes = job.scene.shapes()
     ball = [SeenBall.around(shapes[s.index] for s in moving)]
-    return Movers(SeenBalls.of(ball if use is Use.SHADOW else with_images(job, ball)))
+    turns = use is Use.STEP and job.orbits is not None and job.orbits.move
+    ahead = AHEAD_OF_ORBITS if turns else AHEAD[use]
+    return Movers(SeenBalls.of(ball if use is Use.SHADOW else with_images(job, ball)), ahead)
 
 
 def _balanced(weights: list, moving: list, seen: list) -> list:
