@@ -70,7 +70,7 @@ def carried_back(scene: mi.Scene, at: tuple[np.ndarray, np.ndarray]) -> float:
             following = si.spawn_ray(si.to_world(bs.wo))
             on_surface = deposit(a, si.n, -following.d)
             records, hit = DeltaRecords(1, 1), Hit.of(ray, pi)
-            records.turns = DeltaTurn(-following.d, b)
+            records.turns = DeltaTurn(-following.d, b, mi.Vector3f(0), mi.Float(0))
             with motion.attached() as moving:
                 summand = records.motion(hit, moving) + dr.dot(on_surface, moving.of_surface(hit))
                 total += tangents(summand)[0]
