@@ -25,7 +25,7 @@ from ..core.records import Hit
 from ..core.surface_code import surface_code
 from ..core.varying import varying
 from ..paths.delta_step import delta_step
-from ..paths.orbits import Orbits, ball_motion
+from ..paths.orbits import Orbits
 from ..plan.motion import Displacements
 
 
@@ -64,7 +64,7 @@ class DeltaRecords:
         """Attached q·(centre) + s·(radius) of the spheres that the vertices `hit` are on (flat arrays)."""
         t = self.turns
         active = dr.any(t.q != 0) | (t.s != 0)
-        centre, radius = ball_motion(moving, dr.select(active, hit.shape, 0), *orbits.ball(hit.shape, active))
+        centre, radius = orbits.motion(moving, dr.select(active, hit.shape, 0))
         return dr.select(active, dr.dot(t.q, centre) + t.s * radius, 0)
 
     def motion(self, hit: Hit, moving: Displacements) -> mi.Float:

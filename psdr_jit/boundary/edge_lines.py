@@ -138,6 +138,36 @@ def radiance_by_depth(
     return by_depth, final
 
 
+@dataclass
+class _Past:
+    """What is seen past an edge; detached, one entry per kept line."""
+
+    lane: mi.UInt32
+    source: Hit
+    wavelengths: mi.Color0f
+
+
+def arriving(job: Job, view: EdgeView, source: Hit, records: SubpathRecords) -> mi.Spectrum:
+    """Radiance from the `source` past each edge, for every recorded vertex (flat, see `SubpathRecords`).
+
+    Within the depth that its subpath leaves, and without what the source itself emits.
+    """
+    lane, left = records.lane_of(), longest_path(job) - records.vertex_of()
+    useful = records.connected()
+    kept = dr.compress(useful)
+    if dr.width(kept) == 0:
+        return dr.zeros(mi.Spectrum, dr.width(lane))
+    slot = slots(records, kept)
+    past = dr.gather(_Past, _Past(view.lane, source, view.wavelengths), kept)
+    dr.eval(past)  # in one kernel, see `compact`
+    ray = mi.Ray3f(past.source.o, past.source.d, 0, past.wavelengths)
+    pi, vertices = past.source.intersection(), longest_path(job) + 1
+    by_depth, final = radiance_by_depth(job, ray, pi, past.lane, vertices, mi.Bool(True), mi.Bool(False))
+    needed = dr.gather(mi.Bool, useful, lane)
+    slot = dr.gather(mi.UInt32, slot, lane)
+    return dr.select(needed, by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed)), 0)
+
+
 def longest_path(job: Job) -> int:
     """Vertices on both sides of an edge together, at most: the edge's side and an emitter take a segment each."""
     return job.options.max_depth - 2 if job.options.max_depth != -1 else UNLIMITED_VERTICES

@@ -24,9 +24,9 @@ from ..core.streams import Stream
 from ..edges.table import look_behind
 from ..plan.job import Job
 from ..sampling.relevance import SecondaryEdges
-from .edge_lines import EdgeLine, EdgeView, longest_path, longest_subpath, radiance_by_depth, slots, trace_receivers
+from .edge_lines import EdgeLine, EdgeView, arriving, longest_subpath, trace_receivers
 from .segment_motion import BoundarySamples
-from .sensor_subpath import Receivers, SubpathRecords, subpaths
+from .sensor_subpath import Receivers, subpaths
 
 
 @dataclass
@@ -60,7 +60,7 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
     a = -(1 - b.ratio) * v.sight.n_perp - turn
     receivers = Receivers(v.lane, v.receiver, v.wavelengths, v.value * (b.sign / v.pdf), a, mi.Vector3f(0))
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
-    value = job.call.counters.rejected.keep_finite(records.data.W * _radiance(job, b, records))
+    value = job.call.counters.rejected.keep_finite(records.data.W * arriving(job, v, b.source, records))
     dr.eval(value)
     return BoundarySamples(
         at=v.sight.at,
@@ -72,22 +72,3 @@ def evaluate(job: Job, edges: SecondaryEdges, b: Background) -> BoundarySamples:
         source_motion=lambda moving: dr.dot(turn - b.ratio * v.sight.n_perp, moving.of_surface(b.source)),
         drawn=v.drawn,
     )
-
-
-def _radiance(job: Job, b: Background, records: SubpathRecords) -> mi.Spectrum:
-    """L_S for every recorded vertex, within the depth that its subpath leaves (flat, see `SubpathRecords`)."""
-    lane, left = records.lane_of(), longest_path(job) - records.vertex_of()
-    useful = records.connected()
-    kept = dr.compress(useful)
-    if dr.width(kept) == 0:
-        return dr.zeros(mi.Spectrum, dr.width(lane))
-    slot = slots(records, kept)
-    s = dr.gather(Background, b, kept)
-    dr.eval(s)  # in one kernel, see `compact`
-    ray = mi.Ray3f(s.source.o, s.source.d, 0, s.view.wavelengths)
-    pi, vertices = s.source.intersection(), longest_path(job) + 1
-    by_depth, final = radiance_by_depth(job, ray, pi, s.view.lane, vertices, mi.Bool(True), mi.Bool(False))
-    needed = dr.gather(mi.Bool, useful, lane)
-    slot = dr.gather(mi.UInt32, slot, lane)
-    L = by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed))
-    return dr.select(needed, L, 0)

@@ -20,12 +20,11 @@ from ..core.compaction import compact
 from ..core.records import Hit
 from ..core.streams import Stream
 from ..edges.table import look_beside
-from ..paths.orbits import ball_motion
 from ..plan.job import Job
 from ..sampling.relevance import SecondaryEdges
-from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, slots
+from .edge_lines import EdgeView, arriving, longest_subpath
 from .segment_motion import BoundarySamples
-from .sensor_subpath import Receivers, SubpathRecords, subpaths
+from .sensor_subpath import Receivers, subpaths
 
 
 @dataclass
@@ -37,8 +36,6 @@ class OrbitSide:
     sign: mi.Float  # −1 on side −s, +1 on side +s
     q: mi.Vector3f  # covector on the centre, and −q on u_D
     s: mi.Float  # on the relative change of the radius
-    centre: mi.Point3f
-    radius: mi.Float
 
 
 def trace(job: Job, edges: SecondaryEdges, view: EdgeView | None) -> OrbitSide | None:
@@ -54,7 +51,7 @@ def trace(job: Job, edges: SecondaryEdges, view: EdgeView | None) -> OrbitSide |
     sphere = job.orbits.seen(x_D, end.shape, v.sight.ω, source.shape, differs & pi.is_valid())
     q, s = sphere.covectors(v.sight.r * v.sight.n_perp)
     sign = dr.select(which == 0, -1.0, 1.0)
-    found = OrbitSide(v, source, sign, q, s, sphere.centre, sphere.radius)
+    found = OrbitSide(v, source, sign, q, s)
     return compact(found, sphere.holds)
 
 
@@ -64,29 +61,11 @@ def evaluate(job: Job, edges: SecondaryEdges, o: OrbitSide) -> BoundarySamples:
     value = v.value * (o.sign / v.pdf)
     receivers = Receivers(v.lane, v.receiver, v.wavelengths, value, -o.q, mi.Vector3f(0))
     records = subpaths(job, Stream.INDIRECT_SUBPATH, receivers, longest_subpath(job))
-    value = job.call.counters.rejected.keep_finite(records.data.W * _arriving(job, o, records))
+    value = job.call.counters.rejected.keep_finite(records.data.W * arriving(job, v, o.source, records))
     dr.eval(value)
 
     def source_motion(moving) -> mi.Float:
-        centre, radius = ball_motion(moving, o.source.shape, o.centre, o.radius)
+        centre, radius = job.orbits.motion(moving, o.source.shape)
         return dr.dot(o.q, centre) + o.s * radius
 
     return BoundarySamples(v.sight.at, v.sight.ω, mi.Vector3f(0), v.wavelengths, records, value, source_motion, v.drawn)
-
-
-def _arriving(job: Job, o: OrbitSide, records: SubpathRecords) -> mi.Spectrum:
-    """L for every recorded vertex, within the depth that its subpath leaves (flat, see `SubpathRecords`)."""
-    lane, left = records.lane_of(), longest_path(job) - records.vertex_of()
-    useful = records.connected()
-    kept = dr.compress(useful)
-    if dr.width(kept) == 0:
-        return dr.zeros(mi.Spectrum, dr.width(lane))
-    slot = slots(records, kept)
-    side = dr.gather(OrbitSide, o, kept)
-    dr.eval(side)  # in one kernel, see `compact`
-    ray = mi.Ray3f(side.source.o, side.source.d, 0, side.view.wavelengths)
-    pi, vertices = side.source.intersection(), longest_path(job) + 1
-    by_depth, final = radiance_by_depth(job, ray, pi, side.view.lane, vertices, mi.Bool(True), mi.Bool(False))
-    needed = dr.gather(mi.Bool, useful, lane)
-    slot = dr.gather(mi.UInt32, slot, lane)
-    return dr.select(needed, by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed)), 0)

@@ -24,7 +24,6 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
 from ..paths.delta_step import delta_step
-from ..paths.orbits import ball_motion
 from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, emission_towards, emitter_behind, next_event
@@ -80,7 +79,6 @@ class SpatialFlow(Flow):
             return ω, mi.Float(1)
         active = active & ~vertex.onward.delta & ~following.mirrored
         sphere = orbits.seen(dr.detach(x), vertex.hit.shape, ω, following.hit.shape, active)
-        code = dr.select(sphere.holds, following.hit.shape, 0)
-        of_centre, of_radius = ball_motion(moves, code, sphere.centre, sphere.radius)
+        of_centre, of_radius = orbits.motion(moves, dr.select(sphere.holds, following.hit.shape, 0))
         δ = of_centre - (x - dr.detach(x))
         return ω + sphere.turn(δ, of_radius), 1 + sphere.stretch(δ, of_radius)

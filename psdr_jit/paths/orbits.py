@@ -45,8 +45,6 @@ class Orbit:
     """The sphere that a direction ω from x leads to. Detached."""
 
     holds: mi.Bool  # is there one, and does it carry directions along?
-    centre: mi.Point3f
-    radius: mi.Float  # [m]
     ŵ: mi.Vector3f  # unit, from x to the centre
     D: mi.Float  # distance of the centre [m]
     ω: mi.Vector3f
@@ -103,33 +101,33 @@ class Orbits:
         active = active & (sphere > 0) & (sphere != _BESIDE) & (self._number(own, active) == 0)
         return self._orbit(sphere - 1, x, ω, active)
 
-    def ball(self, met: mi.UInt32, active: mi.Bool) -> tuple[mi.Point3f, mi.Float]:
-        """Centre and radius of the sphere `met`."""
-        k = self._number(met, active) - 1
+    def motion(self, moves, met: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+        """Attached displacement of the centre of the sphere `met`, and the relative one of its radius: (0, 0).
+
+        Velocities are affine in the material point: two of them on one axis tell. `moves`: `Displacements`; `met`: 0
+        where there is none.
+        """
+        centre, radius = self._ball(self._number(met, met != 0) - 1, met != 0)
+        axis = mi.Vector3f(0, 0, 1)
+        one, other = (
+            moves.of_surface(Hit(centre, d, radius, met, mi.UInt32(0), mi.Point2f(0))) for d in (axis, -axis)
+        )
+        ρ = dr.dot(one - other, axis) / (2 * dr.select(met != 0, radius, 1))
+        return (one + other) / 2, ρ
+
+    def _ball(self, k: mi.UInt32, active: mi.Bool) -> tuple[mi.Point3f, mi.Float]:
         return dr.gather(mi.Point3f, self.centres, k, active), dr.gather(mi.Float, self.radii, k, active)
 
     def _number(self, code: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         return dr.gather(mi.UInt32, self.numbers, code, active & (code < dr.width(self.numbers)))
 
     def _orbit(self, k: mi.UInt32, x: mi.Point3f, ω: mi.Vector3f, active: mi.Bool) -> Orbit:
-        centre, radius = dr.gather(mi.Point3f, self.centres, k, active), dr.gather(mi.Float, self.radii, k, active)
+        centre, radius = self._ball(k, active)
         w = mi.Vector3f(centre - x)
         D = dr.norm(w)
         cos = dr.dot(ω, w) / D
         holds = active & (D > FAR * radius) & (cos > 0)
-        return Orbit(holds, centre, radius, w / D, D, ω, dr.select(holds, cos, 1))
-
-
-def ball_motion(moves, code: mi.UInt32, centre: mi.Point3f, radius: mi.Float) -> tuple[mi.Vector3f, mi.Float]:
-    """Attached displacement of the centre of the sphere `code`, and the relative one of its radius: (0, 0).
-
-    Velocities are affine in the material point: two of them on one axis tell. `moves`: `Displacements`.
-    """
-    axis = mi.Vector3f(0, 0, 1)
-    one, other = (
-        moves.of_surface(Hit(centre, d, radius, code, mi.UInt32(0), mi.Point2f(0))) for d in (axis, -axis)
-    )
-    return (one + other) / 2, dr.dot(one - other, axis) / (2 * radius)
+        return Orbit(holds, w / D, D, ω, dr.select(holds, cos, 1))
 
 
 def _carries(shape: ShapeFacts) -> bool:

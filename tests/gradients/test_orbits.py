@@ -46,7 +46,7 @@ def blocks(images: np.ndarray) -> np.ndarray:
 def orbit(x: mi.Point3f, centre: mi.Point3f, ω: mi.Vector3f) -> Orbit:
     w = mi.Vector3f(centre - x)
     D = dr.norm(w)
-    return Orbit(mi.Bool(True), centre, mi.Float(RADIUS), w / D, D, ω, dr.dot(ω, w) / D)
+    return Orbit(mi.Bool(True), w / D, D, ω, dr.dot(ω, w) / D)
 
 
 def rays(count: int = 64) -> tuple[mi.Point3f, mi.Point3f, mi.Vector3f]:
