@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..core.ad import backpropagate, tangents
 from ..core.records import Hit
+from ..paths.rays import ROUNDING
 from .chain_outline import Curve, crossed_curve
 from .chain_patterns import NO_FAMILY
 from .chain_sweeps import AtRest, slope_at_end
@@ -41,14 +42,15 @@ def starts_behind(pair: Pair) -> mi.Bool:
     """Do the paths part because one of them begins its segment behind the face of a mesh that the other meets?
 
     Rays start a small height off their surfaces. Inside of a body with a sharp edge, as near to it as that height, they
-    start outside and never come back in: there is no such gap.
+    start outside and never come back in: there is no such gap. Which side it is on is known up to rounding.
     """
     a, b = pair.a, pair.b
     first = (a.shape != 0) & ((b.shape == 0) | (a.t < b.t))
     met, other = dr.select(first, a, b), dr.select(first, b, a)
     asked = (met.shape != 0) & (pair.last > 0) & ~pair.horizon & (pair.family == NO_FAMILY)
     si = met.interaction(asked, mi.RayFlags.Minimal)
-    behind = dr.dot(si.n, si.p - other.o) * dr.dot(si.n, met.d) <= 0
+    rounding = ROUNDING * (1 + dr.max(dr.abs(si.p)))
+    behind = dr.mulsign(dr.dot(si.n, si.p - other.o), dr.dot(si.n, met.d)) <= rounding
     return asked & si.shape.is_mesh() & behind
 
 

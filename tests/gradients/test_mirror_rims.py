@@ -120,8 +120,11 @@ def test_a_floor_sees_balls(llvm, case):
 
 
 def test_a_floor_sees_as_much_of_a_fine_ball_as_of_a_sphere(llvm):
-    """What the outline hides, the horizon within its rim brings back: without it, 50 of the sum is missing."""
-    integrator = spec(3, sppc=0, sppp=0, sppd=0, spps=0, sppi=1)
+    """What the outline hides, the horizon within its rim brings back: without it, 50 of the sum is missing.
+
+    Directions turn along with the sphere, and its interior term has a share of that (`paths.orbits`).
+    """
+    integrator = spec(3, sppc=1, sppp=0, sppd=0, spps=0, sppi=1)
     balls = (sphere(64, bsdf=BRIGHT), "vertex_positions"), ({"type": "sphere", "bsdf": BRIGHT}, "to_world")
     sums = [forward(perturb(over_a_floor(ball), f"ball.{key}", direction=(1, 0, 0)), integrator, 8, 256).sum((1, 2, 3))
             for ball, key in balls]  # fmt: skip
