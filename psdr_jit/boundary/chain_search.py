@@ -181,6 +181,17 @@ def _joined(parts: list) -> Search | Crossing | None:
     return joined
 
 
+def _stored(search: Search) -> Search:
+    """The searches as arrays that kernels read, two or more: the first round, and the last search, then need no kernels
+    of their own."""
+    if _width(search) == 1:
+        only = dr.arange(mi.UInt32, 2)
+        search = dr.gather(Search, search, dr.zeros(mi.UInt32, 2))
+        search.mode = dr.select(only == 0, search.mode, END)
+    dr.make_opaque(search)
+    return search
+
+
 def _width(part: Search | Crossing) -> int:
     return dr.width(part.at.sample)
 
@@ -190,7 +201,7 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     n = lines.count
     sample = dr.arange(mi.UInt32, n)
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
-    left = Search.begin(Interval.whole(sample, key))
+    left = _stored(Search.begin(Interval.whole(sample, key)))
     found, looks = [], FIRST_LOOKS
     guesses = Guesses(lines.analytic, any(shape.smooth for shape in lines.job.facts.shapes))
     while left is not None:
@@ -206,5 +217,6 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
         # Those that halve, which takes long, side by side.
         parts = [compact(search, halving), compact(search, search.mode <= PROBE)]
         left = _joined([*parts, None if before is None else Search.begin(before)])
+        left = None if left is None else _stored(left)
         looks *= 2
     return _joined(found)

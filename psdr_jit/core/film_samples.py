@@ -17,7 +17,7 @@ import numpy as np
 
 from .film import sampled_window
 from .levels import packed, unpacked
-from .low_discrepancy import LaneSampler, pixel_sampler
+from .low_discrepancy import LaneSampler
 from .upload import uploaded
 from .varying import varying
 
@@ -98,23 +98,29 @@ class FilmSamples:
     corner: tuple[float, float]  # of the sampled window [px]
     size: tuple[int, int]  # its width and height [px]
     spp: int  # on average
-    first: mi.UInt32 | None = None  # lane of the first sample of every pixel, and of one more; None: `spp` in each
-    pixels: mi.UInt32 | None = None  # pixel of every lane
+    first: mi.UInt32  # lane of the first sample of every pixel, and of one more
+    pixels: mi.UInt32  # pixel of every lane
 
     @staticmethod
     def over(film: mi.Film, spp: int, density: FilmDensity | None = None) -> FilmSamples:
-        """`spp` samples per pixel of the sampled window of `film`, spread as `density` wishes."""
+        """`spp` samples per pixel of the sampled window of `film`, spread as `density` wishes.
+
+        Where they are spread evenly that is stored all the same: a pilot's kernels are then those of later calls.
+        """
         lower, upper = sampled_window(film)
-        size = tuple(int(n) for n in upper - lower)
-        even = FilmSamples(tuple(map(float, lower)), size, spp)
+        corner, size = tuple(map(float, lower)), tuple(int(n) for n in upper - lower)
+        count = size[0] * size[1]
         if density is None or spp < 2:
-            return even
-        counts = density.counts(film, spp).ravel()
-        first = uploaded(mi.UInt32, np.concatenate([[0], np.cumsum(counts)]))
-        begins = dr.zeros(mi.UInt32, int(counts.sum()))
-        dr.scatter(begins, mi.UInt32(1), dr.gather(mi.UInt32, first, dr.arange(mi.UInt32, counts.size - 1) + 1))
-        pixels = dr.cumsum(begins)
-        return FilmSamples(even.corner, size, spp, first, pixels)
+            per_pixel = varying(mi.UInt32, spp)
+            first, pixels = dr.arange(mi.UInt32, count + 1) * per_pixel, dr.arange(mi.UInt32, count * spp) // per_pixel
+        else:
+            counts = density.counts(film, spp).ravel()
+            first = uploaded(mi.UInt32, np.concatenate([[0], np.cumsum(counts)]))
+            begins = dr.zeros(mi.UInt32, int(counts.sum()))
+            dr.scatter(begins, mi.UInt32(1), dr.gather(mi.UInt32, first, dr.arange(mi.UInt32, count - 1) + 1))
+            pixels = dr.cumsum(begins)
+        dr.eval(first, pixels)
+        return FilmSamples(corner, size, spp, first, pixels)
 
     def by_pixel(self, lane: mi.UInt32, value: mi.UInt32) -> np.ndarray:
         """(H, W) of the sampled window: sums of a `value` of each sample `lane`. Waits for them."""
@@ -130,17 +136,11 @@ class FilmSamples:
 
     def place(self, lane: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
         """`(pixel, number among its samples)`."""
-        if self.pixels is None:
-            per_pixel = varying(mi.UInt32, self.spp)
-            pixel = lane // per_pixel
-            return pixel, lane - pixel * per_pixel
         pixel = dr.gather(mi.UInt32, self.pixels, lane)
         return pixel, lane - dr.gather(mi.UInt32, self.first, pixel)
 
     def sampler(self, seed: mi.UInt32, lane: mi.UInt32) -> LaneSampler:
         """A sequence of random numbers for every pixel, well spread over its samples."""
-        if self.pixels is None:
-            return pixel_sampler(seed, lane, self.spp)
         pixel, number = self.place(lane)
         return LaneSampler(number, mi.sample_tea_32(seed, pixel)[0])
 
@@ -152,8 +152,6 @@ class FilmSamples:
 
     def in_pixel(self, lane: mi.UInt32) -> mi.Float:
         """Number of samples of the pixel of `lane`."""
-        if self.pixels is None:
-            return varying(mi.Float, self.spp)
         pixel = dr.gather(mi.UInt32, self.pixels, lane)
         return mi.Float(dr.gather(mi.UInt32, self.first, pixel + 1) - dr.gather(mi.UInt32, self.first, pixel))
 
@@ -162,15 +160,10 @@ class FilmSamples:
         place = dr.floor(p - varying(mi.Point2f, self.corner))
         width, height = (varying(mi.Float, n) for n in self.size)
         inside = (place.x >= 0) & (place.y >= 0) & (place.x < width) & (place.y < height)
-        count = varying(mi.Float, self.spp)
-        if self.pixels is not None:
-            pixel = mi.UInt32(place.y) * mi.UInt32(width) + mi.UInt32(place.x)
-            last = dr.gather(mi.UInt32, self.first, pixel + 1, inside)
-            count = mi.Float(last - dr.gather(mi.UInt32, self.first, pixel, inside))
-        return dr.select(inside, count, 0)
+        pixel = mi.UInt32(place.y) * mi.UInt32(width) + mi.UInt32(place.x)
+        last = dr.gather(mi.UInt32, self.first, pixel + 1, inside)
+        return dr.select(inside, mi.Float(last - dr.gather(mi.UInt32, self.first, pixel, inside)), 0)
 
     def weight(self) -> mi.Float:
         """Of every sample, for means: 1 on average over the film."""
-        if self.pixels is None:
-            return mi.Float(1)
         return varying(mi.Float, self.spp) / self.in_pixel(dr.arange(mi.UInt32, self.count))

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .varying import varying
-
 #: 2^-24: the upper 24 bits of a 32-bit integer as a number in [0, 1).
 _ULP = 2.0**-24
 
@@ -99,10 +97,3 @@ class LaneSampler:
 def lane_sampler(seed: mi.UInt32, lane: mi.UInt32) -> LaneSampler:
     """One sequence for all lanes, in the order of `lane`: for samples that are sorted along the edges."""
     return LaneSampler(mi.UInt32(lane), mi.UInt32(seed))
-
-
-def pixel_sampler(seed: mi.UInt32, lane: mi.UInt32, spp: int) -> LaneSampler:
-    """A sequence for every pixel, where `spp` consecutive lanes belong to one."""
-    per_pixel = varying(mi.UInt32, spp)
-    pixel = lane // per_pixel
-    return LaneSampler(lane - pixel * per_pixel, mi.sample_tea_32(seed, pixel)[0])

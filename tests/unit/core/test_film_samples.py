@@ -109,3 +109,13 @@ def test_means_are_those_of_even_samples(llvm, rfilter):
         images.append(np.array(films.develop_samples(target, at, mi.Spectrum(p.x + 2 * p.y), mi.Color0f())))
     assert np.allclose(*images, atol=0.02)
     assert np.ptp(images[0]) > 5
+
+
+def test_pixels_have_sequences_of_their_own(llvm):
+    side, spp = 32, 16
+    samples = FilmSamples.over(film(width=side, height=side), spp)
+    sampler = samples.sampler(mi.UInt32(9), dr.arange(mi.UInt32, samples.count))
+    points = np.array(sampler.next_2d()).T.reshape(-1, spp, 2)
+    for block in points:
+        assert np.histogram2d(*block.T, bins=(4, 4), range=[[0, 1], [0, 1]])[0].max() == 1
+    assert len(np.unique(points[:, 0, 0])) > len(points) * 0.99

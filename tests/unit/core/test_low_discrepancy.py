@@ -52,14 +52,3 @@ def test_numbers_are_uniform_over_keys(variant):
         assert np.abs(values.mean(1) - 0.5).max() < 5 * np.sqrt(1 / 12 / COUNT)
         assert np.abs(values.var(1) - 1 / 12).max() < 5 * np.sqrt(1 / 180 / COUNT)
         assert np.abs(np.corrcoef(values) - np.eye(3)).max() < 5 / np.sqrt(COUNT)
-
-
-def test_pixels_have_sequences_of_their_own(variant):
-    from psdr_jit.core.low_discrepancy import pixel_sampler
-
-    spp = 16
-    sampler = pixel_sampler(mi.UInt32(9), dr.arange(mi.UInt32, COUNT), spp)
-    points = np.array(sampler.next_2d()).T.reshape(-1, spp, 2)
-    for block in points:
-        assert np.histogram2d(*block.T, bins=(4, 4), range=[[0, 1], [0, 1]])[0].max() == 1
-    assert len(np.unique(points[:, 0, 0])) > len(points) * 0.99
