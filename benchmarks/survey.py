@@ -17,10 +17,11 @@ import numpy as np
 
 import psdr_jit
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.derivative.check import FAIL, PASS, CheckResult
+from psdr_jit.derivative.check import CheckResult
 from psdr_jit.derivative.finite_differences import seen_distance
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.sampler import DerivativeSampler
+from psdr_jit.derivative.verdict import FAIL, PASS
 from psdr_jit.errors import PsdrError, UnsupportedWarning
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import ParamInfo, differentiable_params

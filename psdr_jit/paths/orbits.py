@@ -3,8 +3,8 @@
 The spatial form keeps the direction in which a smooth vertex x is left. If a sphere is met there, the vertex on it
 slides by 1/cosθ, its normal turns, and what a delta lobe leads to moves farther with every such passage: the derivative
 has heavy tails. But any smooth field of directions at x may be followed in place of resting ones. Let c be the centre
-of the sphere, R its radius, D ŵ = c − x, and cosθ = ω·ŵ. Keeping the azimuth about ŵ and sinθ D/R, the distance at which
-the line passes the centre,
+of the sphere, R its radius, D ŵ = c − x, and cosθ = ω·ŵ. Keeping the azimuth about ŵ and sinθ D/R, the distance at
+which the line passes the centre,
 
     η(ω) = ω̇ = [ẇ (ŵ·ω) − ŵ (ẇ·ω)]/D + g (ω − ŵ/cosθ),      g = Ṙ/R − Ḋ/D,      ẇ = ċ − ẋ,      Ḋ = ŵ·ẇ,
 

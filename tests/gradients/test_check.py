@@ -8,10 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit.derivative.check import FAIL, INCONCLUSIVE, PASS, check_gradient, judge
+from psdr_jit.derivative.check import check_gradient
 from psdr_jit.derivative.finite_differences import CentralDifference
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import GroupedImages, block_means, block_test, gain
+from psdr_jit.derivative.verdict import FAIL, INCONCLUSIVE, PASS, judge
 from psdr_jit.scene import io as scene_io
 
 SHAPE = (32, 32, 3)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from psdr_jit.core import progress
-from psdr_jit.derivative.check import CheckResult, Verdict
+from psdr_jit.derivative.check import CheckResult
 from psdr_jit.derivative.gradient import GradientResult
+from psdr_jit.derivative.verdict import Verdict
 from psdr_jit.inverse.loop import Result
 from psdr_jit.plan.plan import EdgeCount, Plan, TermPlan
 
