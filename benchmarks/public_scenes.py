@@ -2,6 +2,7 @@
 
     python -m benchmarks.public_scenes FOLDER...            (hours; append to benchmarks/results/public_scenes.jsonl)
     python -m benchmarks.public_scenes FOLDER --part 0/2    (every second scene, for two processes side by side)
+    python -m benchmarks.public_scenes FOLDER --again       (what is undecided, that known best first)
 
 Each thing is moved a little, and compared with differences for so many seconds. What has a row is not done again. The
 first thing of every scene comes first, then the second of every scene: interrupted, a run has seen most scenes.
@@ -21,7 +22,7 @@ from typing import Any
 import mitsuba as mi
 
 from benchmarks import rows
-from benchmarks.survey import DEPTH, NOT_FINITE, SIDE, WRONG, Row, movable, row_of, shrunk, spread
+from benchmarks.survey import DEPTH, NOT_FINITE, SIDE, UNDECIDED, WRONG, Row, movable, row_of, shrunk, spread
 from psdr_jit.errors import PsdrError
 from psdr_jit.scene import io as scene_io
 
@@ -74,6 +75,14 @@ class Corpus:
                     yield name, path, chosen[(turn + number) % len(chosen)]
 
 
+def undecided(corpus: Corpus, known: list[dict[str, Any]]) -> list[tuple[str, Path, str]]:
+    """Of the pairs that have rows, those without a verdict, by the error of their gain."""
+    error = {row["case"]: row["stderr"] or float("inf") for row in known if row["word"] == UNDECIDED}
+    found = [(name, path, case.removeprefix(f"{name}: "))
+             for name, path in corpus.files() for case in error if case.startswith(f"{name}: ")]  # fmt: skip
+    return sorted(found, key=lambda pair: error[case_of(pair[0], pair[2])])
+
+
 def case_of(name: str, param: str) -> str:
     return f"{name}: {param}"
 
@@ -110,12 +119,14 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=MOST, help="things moved in a scene (default: %(default)s)")
     parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth scene, from the Kth on")
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
+    parser.add_argument("--again", action="store_true", help="look at what is undecided once more")
     args = parser.parse_args()
     scene_io.use_variant(scene_io.DEFAULT_VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
-    done = {row["case"] for row in rows.read([args.out])} if args.out.exists() else set()
+    known = rows.latest(rows.read([args.out])) if args.out.exists() else []
     corpus, bad = Corpus(args.folders, args.most, args.part), 0
-    for name, path, param in corpus.pairs():
+    done = set() if args.again else {row["case"] for row in known}
+    for name, path, param in undecided(corpus, known) if args.again else corpus.pairs():
         case = case_of(name, param)
         if case in done:
             continue

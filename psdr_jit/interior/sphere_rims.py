@@ -33,10 +33,10 @@ from ..core.sensor_frame import KINDS, lens_point, look_at, pixel_footprint
 from ..core.streams import Stream, stream_seed
 from ..core.surface_code import surface_code
 from ..core.varying import varying
-from ..edges.curves import attached_to_world
 from ..paths.recording import GRAZING
 from ..plan.job import Job
 from ..scene.registry import registry_values
+from ..scene.spheres import spheres_of
 from .camera_pass import CameraPass
 
 #: cosθ up to which there are samples: the outer 8 % of a sphere's radius. What is met more edge-on than `GRAZING` has
@@ -110,11 +110,7 @@ class SphereRims:
         if not found:
             return None
         numbers = registry_values(job.scene, {index: k + 1 for k, index in enumerate(found)})
-        spheres, k = job.scene.shapes(), dr.arange(mi.UInt32, len(found))
-        x_axis, _, _, centre = attached_to_world(tuple(spheres[index] for index in found), k)
-        centres, radii = mi.Point3f(dr.detach(centre)), dr.detach(dr.norm(x_axis))
-        dr.make_opaque(numbers, centres, radii)
-        return SphereRims(job, len(found), numbers, centres, radii)
+        return SphereRims(job, len(found), numbers, *spheres_of(job.scene, found))
 
     def left_to_film(self, samples: FilmSamples, ray: mi.Ray3f) -> mi.Float:
         """Weight of the film's own `samples`, with their camera rays: n_film / (n_film + n_rim)."""

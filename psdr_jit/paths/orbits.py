@@ -26,12 +26,11 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.records import Hit
-from ..core.upload import uploaded
 from ..scene.facts import SceneFacts, ShapeFacts
 from ..scene.registry import registry_values
+from ..scene.spheres import spheres_of
 
 #: Distance from the centre of a sphere beyond which directions turn with it, relative to its radius: 1/cos²θ < 6.
 FAR = 1.1
@@ -90,10 +89,7 @@ class Orbits:
             return None
         values = {s.index: _BESIDE for s in known if s.delta_lobes}
         numbers = registry_values(scene, values | {index: k + 1 for k, index in enumerate(spheres)})
-        columns = np.stack([_to_world(scene.shapes()[index]) for index in spheres])
-        centres = mi.Point3f(*(uploaded(mi.Float, columns[:, i, 3]) for i in range(3)))
-        radii = uploaded(mi.Float, np.linalg.norm(columns[:, :3, 0], axis=1))
-        return Orbits(numbers, centres, radii, any(s.geometry for s in found))
+        return Orbits(numbers, *spheres_of(scene, spheres), any(s.geometry for s in found))
 
     def seen(self, x: mi.Point3f, own: mi.UInt32, ω: mi.Vector3f, met: mi.UInt32, active: mi.Bool) -> Orbit:
         """What the direction ω leads to from x on the shape `own`: the shape `met`, both by `surface_code`."""
@@ -133,7 +129,3 @@ class Orbits:
 def _carries(shape: ShapeFacts) -> bool:
     only_delta = bool(shape.delta_lobes) and not shape.bsdf_flags & int(mi.BSDFFlags.Smooth)
     return shape.plugin == "sphere" and only_delta and not shape.is_emitter
-
-
-def _to_world(sphere: mi.Shape) -> np.ndarray:
-    return np.array(mi.traverse(sphere)["to_world"].matrix, dtype=float).reshape(4, 4)
