@@ -72,7 +72,9 @@ def assert_alike(mirrored: tuple, behind: tuple) -> None:
     assert np.abs(mirrored[0] - behind[0]).max() < 0.01 * size + 4 * error.max()
 
 
-@pytest.mark.parametrize(("eye", "direction"), [(ABOVE, (0.6, 0.6, 0.5)), (ASIDE, (1, 0, 0))])
+@pytest.mark.parametrize(
+    ("eye", "direction"), [(ABOVE, (0.6, 0.6, 0.5)), pytest.param(ASIDE, (1, 0, 0), marks=pytest.mark.slow)]
+)
 def test_a_spot_in_a_mirror_is_one_behind_it(llvm, eye, direction):
     mirrored = blocks(scene(True, eye), "receiver.vertex_positions", direction, type="psdr_bdpt", max_depth=3)
     assert_alike(mirrored, blocks(scene(False, eye), "receiver.vertex_positions", direction, max_depth=2))
