@@ -33,7 +33,7 @@ from ..core.sensor_frame import KINDS, lens_point, look_at, pixel_footprint
 from ..core.streams import Stream, stream_seed
 from ..core.surface_code import surface_code
 from ..core.varying import varying
-from ..paths.recording import GRAZING
+from ..paths.edge_on import GRAZING
 from ..plan.job import Job
 from ..scene.registry import registry_values
 from ..scene.spheres import spheres_of

@@ -18,6 +18,7 @@ import mitsuba as mi
 from ..core.records import Continuation
 from ..scene.tubes import Tubes
 from .critical_angle import CriticalAngle
+from .edge_on import EdgeOn
 from .light_technique import LightTechnique
 from .scattering import Aim, Mixture, Scattering, accepted, mixture_pdf, sample_scattering
 
@@ -40,6 +41,7 @@ class PathLimits:
     light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
     aim: Aim | None = None  # where the next direction is worth taking
     aligned: bool = False  # numbers of mirrors and glass are their own: see `walk`
+    edge_on: EdgeOn | None = None  # walks begin beside an edge, which may be the outline of one of these
 
     @property
     def mixture(self) -> Mixture:

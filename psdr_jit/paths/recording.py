@@ -7,12 +7,9 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Hit, Vertex
 from ..core.varying import varying
+from .edge_on import GRAZING
 from .rays import shadow_hit
 from .sink import NoSink, Scatter, Sink
-
-#: Cosine of arrival below which a vertex has no derivative. A sliding vertex moves by 1/cosθ, and at the outline of a
-#: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
-GRAZING = 5e-4
 
 
 class PathRecords(Sink):

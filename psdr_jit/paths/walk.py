@@ -4,7 +4,7 @@ The walk is Mitsuba's `path` (same densities, same power heuristic); what happen
 Two walks from beside an edge have random numbers in common, so that noise cancels in their difference. The outline of a
 mirror or of a ball of glass is met edge-on and passes the light straight on: both walks then meet the same surfaces,
 but one of them a vertex later. With `limits.aligned`, vertices of delta lobes alone draw numbers of their own and leave
-those of all others as they are.
+those of all others as they are. With `limits.edge_on`, first vertices on outlines are seen as the limit shows them.
 
 Everything here is detached: derivatives are attached later, from records (`interior/sweeps.py`) or not at all
 (`boundary/`, whose radiances are primal quantities).
@@ -125,6 +125,8 @@ def walk(
     # a frozen dataclass cannot be loop state
     while dr.hint(active, label="psdr.walk", exclude=[limits]):
         si = interaction(pi, ray, limits)
+        if dr.hint(limits.edge_on is not None, mode="scalar"):
+            si.wi = limits.edge_on.seen(si, active & (path.k == 0))
         met = _emission(scene, si, last, path.k, limits, emission)
         L += path.β * (met.mis * met.value)
         sink.radiance(path.k, L, active)

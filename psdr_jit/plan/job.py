@@ -16,6 +16,7 @@ from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..core.varying import varying
 from ..options import Options
 from ..paths.critical_angle import CriticalAngle, critical_angle
+from ..paths.edge_on import EdgeOn
 from ..paths.light_technique import LightTechnique
 from ..paths.orbits import Orbits
 from ..paths.walk import PathLimits
@@ -35,9 +36,11 @@ TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
 #: Of one render call: spheres that carry directions along, in a tuple once they have been looked for.
 ORBITS: Slot[tuple[Orbits | None] | None] = Slot(lambda: None)
 
+#: Of one render call: spheres and cylinders of mirror or glass, in a tuple once they have been looked for.
+EDGE_ON: Slot[tuple[EdgeOn | None] | None] = Slot(lambda: None)
+
 #: Of one render call: light subpaths, in a tuple once they have been asked for.
 LIGHT: Slot[tuple[LightTechnique | None] | None] = Slot(lambda: None)
-
 
 #: Of one render call: rough glass whose index is differentiated, in a tuple once it has been looked for.
 CRITICAL: Slot[tuple[CriticalAngle | None] | None] = Slot(lambda: None)
@@ -144,7 +147,11 @@ class Job:
     @property
     def limits_beside(self) -> PathLimits:
         """Limits of walks from beside an edge, which are compared."""
-        return replace(self.limits, aligned=self.facts.has_delta_lobes)
+        if not self.facts.has_delta_lobes:
+            return self.limits
+        if self.shared[EDGE_ON] is None:
+            self.shared[EDGE_ON] = (EdgeOn.of(self.scene, self.facts),)
+        return replace(self.limits, aligned=True, edge_on=self.shared[EDGE_ON][0])
 
 
 def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
