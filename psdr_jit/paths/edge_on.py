@@ -40,11 +40,18 @@ class EdgeOn:
         found = {s.index for s in facts.shapes if s.index >= 0 and s.plugin in ROUND and s.delta_lobes}
         return EdgeOn(registry_table(scene, found)) if found else None
 
-    def seen(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Vector3f:
-        """`si.wi`, at the limit where `si` lies on an outline. Detached."""
+    def at_limit(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """`si`, which a ray along `d` meets, with the normal of the outline where it lies on one. Detached.
+
+        What is mirrored there then goes straight on, by 2 `GRAZING` radians.
+        """
         code = dr.reinterpret_array(mi.UInt32, si.shape)
-        wi = mi.Vector3f(si.wi)
-        at_outline = active & si.is_valid() & (dr.abs(wi.z) < BESIDE)
+        cos = dr.dot(si.sh_frame.n, -d)
+        at_outline = active & si.is_valid() & (dr.abs(cos) < BESIDE)
         at_outline &= dr.gather(mi.UInt32, self.shapes, code, at_outline & (code < dr.width(self.shapes))) != 0
-        along = dr.rsqrt(dr.square(wi.x) + dr.square(wi.y)) * dr.sqrt(1 - GRAZING**2)
-        return dr.select(at_outline, mi.Vector3f(wi.x * along, wi.y * along, dr.mulsign(GRAZING, wi.z)), wi)
+        across = dr.normalize(si.sh_frame.n + cos * d)
+        n = mi.Normal3f(dr.sqrt(1 - GRAZING**2) * across - dr.mulsign(GRAZING, cos) * d)
+        si.n = dr.select(at_outline, dr.mulsign(mi.Float(1), dr.dot(si.n, n)) * n, si.n)
+        si.sh_frame = dr.select(at_outline, mi.Frame3f(n), si.sh_frame)
+        si.wi = dr.select(at_outline, si.to_local(-d), si.wi)
+        return si

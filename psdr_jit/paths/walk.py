@@ -126,7 +126,7 @@ def walk(
     while dr.hint(active, label="psdr.walk", exclude=[limits]):
         si = interaction(pi, ray, limits)
         if dr.hint(limits.edge_on is not None, mode="scalar"):
-            si.wi = limits.edge_on.seen(si, active & (path.k == 0))
+            si = limits.edge_on.at_limit(si, ray.d, active & (path.k == 0))
         met = _emission(scene, si, last, path.k, limits, emission)
         L += path.β * (met.mis * met.value)
         sink.radiance(path.k, L, active)
