@@ -43,9 +43,10 @@ import mitsuba as mi
 from psdr_jit.core import film as films
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.compaction import compact
-from psdr_jit.core.low_discrepancy import pixel_sampler
+from psdr_jit.core.low_discrepancy import LaneSampler
 from psdr_jit.core.records import Hit
 from psdr_jit.core.streams import Stream, stream_seed
+from psdr_jit.core.varying import varying
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import Sight
 from psdr_jit.edges.kind_mesh import BetweenFaces
@@ -199,6 +200,13 @@ def first_arrivals(job: Job, p) -> CameraPath | None:
         wavelengths=ray.wavelengths,
     )
     return compact(path, pi.is_valid())
+
+
+def pixel_sampler(seed: mi.UInt32, lane: mi.UInt32, spp: int) -> LaneSampler:
+    """A sequence for every pixel, where `spp` consecutive lanes belong to one."""
+    per_pixel = varying(mi.UInt32, spp)
+    pixel = lane // per_pixel
+    return LaneSampler(lane - pixel * per_pixel, mi.sample_tea_32(seed, pixel)[0])
 
 
 def arrive(path: CameraPath) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
