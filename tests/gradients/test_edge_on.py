@@ -1,55 +1,141 @@
-"""Outlines of smooth glass: seen edge-on it mirrors everything, straight on, so that nothing steps there."""
+"""Faces exactly in line with the viewer or the light: rounding must not decide which of their edges is the outline.
+
+Under parallel projection two edges of such a face cover each other, before and after the box has moved.
+"""
 
 from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import forward
+from fuzz.build import build
+from helpers import assert_grad_close, fd, forward
 
+from benchmarks import meshes
 from psdr_jit.derivative.perturbation import perturb
 
-FILM = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
-BUDGETS = ("sppc", "sppp", "sppd", "sppi", "spps")
-SHAPES = {
-    "sphere": {"type": "sphere", "center": [0.05, 0.03, 0], "radius": 0.6},
-    "cylinder": {"type": "cylinder", "p0": [0.05, -3, 0], "p1": [0.06, 3, 0.1], "radius": 0.5},
-}
-BSDFS = {
-    "glass": {"type": "dielectric"},
-    "plastic": {"type": "plastic", "diffuse_reflectance": 0.2},
-    "window": {"type": "thindielectric"},
-    "mirror": {"type": "conductor", "material": "none", "specular_reflectance": 0.5},
-    "black": {"type": "diffuse", "reflectance": 0.0},
-}
+SPEC = {"type": "psdr_path", "max_depth": 2}
+DIRECTION = (1, 0.3, 0.7)
+STEP = 0.01  # of finite differences: less than a tenth of a pixel
+FURTHER = 1e-4  # past the position at which a face is in line: far beyond rounding, not to be seen in an image
+CENTRE, HALF = np.array([0.03, 0.02, 0]), np.array([0.5, 0.4, 0.6])  # of the box
+QUICK = {"samples": 32, "max_stderr": 0.02}  # a wrong side of the box is off by more
+RIGHT, LEFT = CENTRE[0] + HALF[0], CENTRE[0] - HALF[0]
 
 
-def before_a_glowing_wall(shape: str, bsdf: str) -> mi.Scene:
-    """Beyond its depth everything is black: what is seen by way of more than one vertex is not in the image."""
-    t = mi.ScalarTransform4f()
-    return mi.load_dict({
-        "type": "scene", "body": {**SHAPES[shape], "bsdf": BSDFS[bsdf]},
-        "wall": {"type": "rectangle", "to_world": t.translate([0, 0, -1.5]).scale(6), "emitter": {"type": "area"}},
-        "camera": {"type": "perspective", "fov": 30, "film": FILM,
-                   "to_world": t.look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])},
-    })  # fmt: skip
+def T():
+    return mi.ScalarTransform4f()
 
 
-def term_alone(scene: mi.Scene, budget: str, spp: int) -> float:
-    """Of the derivative by one term, the mean over seeds of the left half of the image less the right half."""
-    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", **dict.fromkeys(BUDGETS, 0), budget: spp}
-    d = forward(perturb(scene, "body.to_world", (1, 0.2, 0)), spec, 4, spp).mean(0)[..., 0]
-    return float(d[:, :6].sum() - d[:, 6:].sum())
+def film() -> dict:
+    return {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
 
 
-@pytest.mark.parametrize("shape, bsdf", [("sphere", "glass"), ("sphere", "plastic"), ("sphere", "window"),
-                                         ("cylinder", "glass")])  # fmt: skip
-def test_the_outline_of_glass_is_no_step(llvm, shape, bsdf):
-    """All of the change is in how the reflectance falls behind it; a little inside of the outline it has by 4 %."""
-    scene = before_a_glowing_wall(shape, bsdf)
-    assert abs(term_alone(scene, "sppp", 64)) < 0.01 * abs(term_alone(scene, "sppc", 256))
+def orthographic(axis, angle) -> dict:
+    """Along an axis, up to the rounding of sine and cosine."""
+    return {"type": "orthographic", "to_world": T().rotate(axis, angle).translate([0, 0, -4]), "film": film()}
 
 
-def test_a_mirror_that_swallows_half_steps_by_half(llvm):
-    half, none = (term_alone(before_a_glowing_wall("sphere", bsdf), "sppp", 64) for bsdf in ("mirror", "black"))
-    assert abs(none) > 1 and np.isclose(half, none / 2, rtol=0.01)
+def perspective(origin, target) -> dict:
+    pose = T().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
+    return {"type": "perspective", "fov": 30, "to_world": pose, "film": film()}
+
+
+def scene_of(camera: dict, shift: float = 0.0, **objects) -> mi.Scene:
+    """The box, moved along x by `shift`; by default under two lamps that light all but its lower and far side."""
+    pose = T().translate(list(CENTRE + [shift, 0, 0])).scale(list(HALF))
+    objects.setdefault("box", {"type": "cube", "to_world": pose, "bsdf": {"type": "diffuse"}})
+    if "lamp" not in objects:
+        objects["lamp"] = {"type": "point", "position": [-3, 2, 4], "intensity": 30.0}
+        objects["fill"] = {"type": "point", "position": [4, 3, 1], "intensity": 15.0}
+    return mi.load_dict({"type": "scene", "camera": camera, **objects}, optimize=False)
+
+
+def open_box() -> mi.Mesh:
+    """The box without its face at +z."""
+    corners = CENTRE + HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4)]
+    faces = np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))])
+    return meshes.flat_mesh("box", corners, faces, mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}}))
+
+
+def assert_right(scene: mi.Scene, samples: int = 256, max_stderr: float = 0.007):
+    """Derivatives of the moving box are those of finite differences, up to 1 %."""
+    motion = perturb(scene, "box.vertex_positions", DIRECTION)
+    reference = fd(motion, SPEC, STEP, 64, 8 * samples)
+    gain, error = assert_grad_close(forward(motion, SPEC, 16, samples), reference, max_stderr)
+    assert abs(gain - 1) < 0.01 + error
+
+
+def assert_alike(scene: mi.Scene, nearby: mi.Scene):
+    """One derivative where a face is in line, as the limit of where it is not.
+
+    The face appears on one side only: finite differences would mix two derivatives.
+    """
+    image, other = (
+        forward(perturb(s, "box.vertex_positions", DIRECTION), SPEC, 4, 1024).mean(0) for s in (scene, nearby)
+    )
+    assert np.linalg.norm(image - other) < 0.01 * np.linalg.norm(other)
+
+
+@pytest.mark.parametrize(
+    "axis, angle, precision",
+    [
+        pytest.param((0, 1, 0), 90, QUICK, marks=pytest.mark.slow),
+        pytest.param((0, 1, 0), 90, {}, marks=pytest.mark.slow),
+        pytest.param((0, 1, 0), 180, {}, marks=pytest.mark.slow),
+        pytest.param((1, 0, 0), 90, {}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_box_seen_along_its_faces(llvm, axis, angle, precision):
+    assert_right(scene_of(orthographic(axis, angle)), **precision)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("x, y", [(RIGHT, 0.3), (RIGHT, 1.3), (LEFT, 0.3)])
+def test_a_perspective_camera_in_the_plane_of_a_face(llvm, x, y):
+    """The face turns away: the derivative is that of the box a little further, when the face has turned indeed."""
+    camera = perspective((x, y, 4), (x / 2, 0, 0))
+    assert_alike(scene_of(camera), scene_of(camera, FURTHER * np.sign(x)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("smooth", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_a_face_that_is_barely_seen(llvm, smooth):
+    """A ball one face of which turns to the viewer by 2e-5: lines of sight to its far side are as good as in its plane.
+
+    A random scene, of which all is left out that does not matter.
+    """
+    place, axis = np.array([0.398, 0.144, 0.618]), [-0.411, -0.744, -0.527]
+    images = []
+    for shift in (0.0, 10 * FURTHER):
+        pose = [["translate", list(place + [0, shift, 0])], ["rotate", axis, 49.1], ["scale", 0.505]]
+        ball = {"type": "mesh", "mesh": "ball", "segments": 16, "smooth": smooth, "to_world": pose}
+        view = {"type": "perspective", "fov": 41.4, "film": film() | {"rfilter": {"type": "box"}},
+                "to_world": [["look_at", [-0.871, 1.976, 3.367], [0.195, 0.3, 0], [0, 1, 0]]]}  # fmt: skip
+        scene = build({"type": "scene", "camera": view, "ball": ball | {"emitter": {"type": "area"}}})
+        motion = perturb(scene, "camera.to_world", rotate=(-0.209, 0.603, 0.77))
+        images.append(forward(motion, SPEC, 4, 256).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.02 * np.linalg.norm(images[1])
+
+
+@pytest.mark.slow
+def test_the_inside_of_an_open_box(llvm):
+    """Its walls are borders seen edge-on, and the edges at its bottom the outline; nothing hides them."""
+    assert_right(scene_of(orthographic((0, 1, 0), 180), box=open_box()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lamp", ["sun", "point"])
+def test_the_shadow_of_a_box_lit_along_its_faces(llvm, lamp):
+    lamps = {
+        "sun": {"type": "directional", "to_world": T().rotate([0, 1, 0], 180)},
+        "point": {"type": "point", "position": [RIGHT, 0.3, 4], "intensity": 20.0},
+    }
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(4), "bsdf": {"type": "diffuse"}}
+    camera = perspective((3, 2, 4), (0, 0, -1.2))
+    scene, nearby = (scene_of(camera, shift, lamp=lamps[lamp], floor=floor) for shift in (0.0, FURTHER))
+    if lamp == "sun":
+        assert_right(scene)
+    else:
+        assert_alike(scene, nearby)
