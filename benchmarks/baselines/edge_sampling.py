@@ -43,10 +43,9 @@ import mitsuba as mi
 from psdr_jit.core import film as films
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.compaction import compact
-from psdr_jit.core.low_discrepancy import LaneSampler
+from psdr_jit.core.film_samples import FilmSamples
 from psdr_jit.core.records import Hit
 from psdr_jit.core.streams import Stream, stream_seed
-from psdr_jit.core.varying import varying
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import Sight
 from psdr_jit.edges.kind_mesh import BetweenFaces
@@ -171,12 +170,12 @@ def along_paths(job: Job, table: EdgeTable, dist: EdgeDistribution, p) -> mi.Spe
     while k < job.options.depth_limit and path is not None:
         seed = mi.sample_tea_32(p.seed, mi.UInt32(k))[0]
         si, u = arrive(path)
-        view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.samples.spp)
+        view = sample_view(job, table, dist, path, si, u, stream_seed(seed, Stream.INDIRECT_EDGE), p.samples)
         if view is not None:
             rng = stream_seed(seed, Stream.INDIRECT_RADIANCE)
-            dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.samples.spp))
+            dr.scatter_add(dL, *across(job, table, view, job.options.depth_limit - k, rng, p.samples))
         if k + 1 < job.options.depth_limit:
-            path = go_on(job, path, si, u, k, stream_seed(seed, Stream.INDIRECT_SUBPATH), p.samples.spp)
+            path = go_on(job, path, si, u, k, stream_seed(seed, Stream.INDIRECT_SUBPATH), p.samples)
         k += 1
     return dL
 
@@ -202,13 +201,6 @@ def first_arrivals(job: Job, p) -> CameraPath | None:
     return compact(path, pi.is_valid())
 
 
-def pixel_sampler(seed: mi.UInt32, lane: mi.UInt32, spp: int) -> LaneSampler:
-    """A sequence for every pixel, where `spp` consecutive lanes belong to one."""
-    per_pixel = varying(mi.UInt32, spp)
-    pixel = lane // per_pixel
-    return LaneSampler(lane - pixel * per_pixel, mi.sample_tea_32(seed, pixel)[0])
-
-
 def arrive(path: CameraPath) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
     """The vertex, and its velocity u_k by motion transport: `(si, u)`, both detached."""
     with dr.resume_grad():
@@ -223,10 +215,10 @@ def arrive(path: CameraPath) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
 
 
 def sample_view(
-    job: Job, table: EdgeTable, dist: EdgeDistribution, path: CameraPath, si, u, seed, spp
+    job: Job, table: EdgeTable, dist: EdgeDistribution, path: CameraPath, si, u, seed, samples: FilmSamples
 ) -> EdgeView | None:
     """One edge point per vertex; kept if the vertex sees it, scatters light from there, and they move apart."""
-    rng = pixel_sampler(seed, path.lane, spp)
+    rng = samples.sampler(seed, path.lane)
     row, t = sample_edge(dist, mi.Float64(rng.next_1d()))
     on = table.on(row, t, mi.Vector4f(si.p.x, si.p.y, si.p.z, 1))
     offset = mi.Vector3f(on.x - si.p)
@@ -256,7 +248,9 @@ def sources_move(facts: SceneFacts) -> bool:
     return any(s.moves and s.is_emitter for s in facts.shapes)
 
 
-def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp: int) -> tuple[mi.Spectrum, mi.UInt32]:
+def across(
+    job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, samples: FilmSamples
+) -> tuple[mi.Spectrum, mi.UInt32]:
     """Both sides of every edge point, at most `segments` from x_k on: `(contribution, camera path)`, 2 lanes each."""
     index = dr.arange(mi.UInt32, 2 * dr.width(view.lane))
     which, v = index & 1, dr.gather(EdgeView, view, index >> 1)
@@ -266,7 +260,7 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
     value = dr.zeros(mi.Spectrum, dr.width(index))
     if segments > 1:
         limits = replace(job.limits, max_depth=segments)
-        rng = pixel_sampler(seed, v.lane, spp)
+        rng = samples.sampler(seed, v.lane)
         L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), mi.Bool(False), differs)
         value += L * speed
 
@@ -282,9 +276,9 @@ def across(job: Job, table: EdgeTable, view: EdgeView, segments: int, seed, spp:
     return v.weight * value * dr.select(which == 0, 1.0, -1.0), v.lane
 
 
-def go_on(job: Job, path: CameraPath, si, u, k: int, seed, spp: int) -> CameraPath | None:
+def go_on(job: Job, path: CameraPath, si, u, k: int, seed, samples: FilmSamples) -> CameraPath | None:
     """To the next vertex, by BSDF sampling with roulette; paths that end are left out."""
-    rng = pixel_sampler(seed, path.lane, spp)
+    rng = samples.sampler(seed, path.lane)
     state = PathState(mi.UInt32(k - 1), path.β, path.η)
     onward = bounce(si, si.bsdf(), rng, state, job.limits, mi.BSDFContext(), mi.Bool(True))
     ray, alive = onward.ray(si), onward.alive

@@ -24,11 +24,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..edges.curves import CURVES_OF, attached_to_world, local_viewpoint, transform_point, transform_vector
+from ..edges.curves import CURVES_OF, local_viewpoint, transform_point, transform_vector
 from ..paths.delta_step import delta_step
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
+from ..scene.poses import attached_to_world
 from ..scene.registry import registry_values
 from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_trace import Pair

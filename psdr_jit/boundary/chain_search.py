@@ -201,10 +201,11 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     n = lines.count
     sample = dr.arange(mi.UInt32, n)
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
-    left = _stored(Search.begin(Interval.whole(sample, key)))
+    left = Search.begin(Interval.whole(sample, key))
     found, looks = [], FIRST_LOOKS
     guesses = Guesses(lines.analytic, any(shape.smooth for shape in lines.job.facts.shapes))
     while left is not None:
+        left = _stored(left)
         many = _width(left) > FEW
         finds = Finds(_width(left), 1 if many else SLOTS)
         pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
@@ -217,6 +218,5 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
         # Those that halve, which takes long, side by side.
         parts = [compact(search, halving), compact(search, search.mode <= PROBE)]
         left = _joined([*parts, None if before is None else Search.begin(before)])
-        left = None if left is None else _stored(left)
         looks *= 2
     return _joined(found)

@@ -36,6 +36,12 @@ class Memory:
     def __setitem__(self, slot: Slot[T], value: T) -> None:
         self._kept[slot] = value
 
+    def once(self, slot: Slot[T], make: Callable[[], T]) -> T:
+        """What is kept there, made by whoever asks first: for what takes more to make than a slot knows."""
+        if slot not in self._kept:
+            self._kept[slot] = make()
+        return self._kept[slot]
+
 
 def key_of(shape: mi.Shape) -> str | int:
     """What stands for a shape in a memory: its id or, as files leave many without one, a number of its own."""

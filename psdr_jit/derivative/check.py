@@ -38,7 +38,7 @@ from psdr_jit.derivative.verdict import (
     SETTLED_SEEDS,
     Verdict,
     judge,
-)  # fmt: skip
+)
 from psdr_jit.errors import OptionError
 from psdr_jit.options import require_count
 from psdr_jit.paths.aovs import Aovs

@@ -13,6 +13,8 @@ from enum import IntEnum
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.poses import attached_to_world
+
 #: Each curve is cut into this many pieces, so that hidden or distant parts get their own weight.
 PIECES = 64
 
@@ -74,17 +76,6 @@ def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
     rows = CurveRows(mi.UInt32(kind), mi.UInt32(owner), mi.Float(start))
     owners = tuple(shape for shape, _ in shapes)
     return CurveSet(owners, mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0]), rows)
-
-
-def attached_to_world(shapes: tuple[mi.Shape, ...], index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
-    """Columns (x, y, z axis, origin) of each lane's object-to-world map, attached to the shapes' `to_world`."""
-    matrices = [mi.traverse(shape)["to_world"].matrix for shape in shapes]
-
-    def column(j: int) -> mi.Vector3f:
-        entries = (dr.concat([mi.Float(m[i, j]) for m in matrices]) for i in range(3))
-        return mi.Vector3f(*(dr.gather(mi.Float, entry, index) for entry in entries))
-
-    return tuple(column(j) for j in range(4))
 
 
 def transform_point(columns: tuple[mi.Vector3f, ...], x: mi.Point3f) -> mi.Point3f:

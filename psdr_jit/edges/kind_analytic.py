@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.poses import attached_to_world
 from .curves import (
     PIECES,
     CurveRows,
     CurveSet,
-    attached_to_world,
     curve_centre,
     curve_lengths,
     curve_point,

@@ -21,7 +21,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
-from .curves import attached_to_world, transform_point, transform_vector
+from ..scene.poses import attached_to_world
+from .curves import transform_point, transform_vector
 from .film_cover import LENS_CENTRE, PatchOnFilm, beside_film
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds

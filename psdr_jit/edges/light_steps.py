@@ -19,7 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.varying import varying
-from .curves import attached_to_world, transform_point, transform_vector
+from ..scene.poses import attached_to_world
+from .curves import transform_point, transform_vector
 from .light_step_rows import LightStepRows
 from .location import EdgeLocation
 

@@ -35,8 +35,8 @@ from ..core.surface_code import surface_code
 from ..core.varying import varying
 from ..paths.edge_on import GRAZING
 from ..plan.job import Job
+from ..scene.poses import spheres_of
 from ..scene.registry import registry_values
-from ..scene.spheres import spheres_of
 from .camera_pass import CameraPass
 
 #: cosθ up to which there are samples: the outer 8 % of a sphere's radius. What is met more edge-on than `GRAZING` has

@@ -29,8 +29,8 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..scene.facts import SceneFacts, ShapeFacts
+from ..scene.poses import spheres_of
 from ..scene.registry import registry_values
-from ..scene.spheres import spheres_of
 
 #: Distance from the centre of a sphere beyond which directions turn with it, relative to its radius: 1/cos²θ < 6.
 FAR = 1.1

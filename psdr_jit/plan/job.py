@@ -30,20 +30,20 @@ from .plan import Plan
 #: Of one render call: the geometry of its sensor.
 FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
 
-#: Of one render call: the curves of its scene, in a tuple once they have been looked for.
-TUBES: Slot[tuple[Tubes | None] | None] = Slot(lambda: None)
+#: Of one render call: the curves of its scene.
+TUBES: Slot[Tubes | None] = Slot(lambda: None)
 
-#: Of one render call: spheres that carry directions along, in a tuple once they have been looked for.
-ORBITS: Slot[tuple[Orbits | None] | None] = Slot(lambda: None)
+#: Of one render call: spheres that carry directions along.
+ORBITS: Slot[Orbits | None] = Slot(lambda: None)
 
-#: Of one render call: spheres and cylinders of mirror or glass, in a tuple once they have been looked for.
-EDGE_ON: Slot[tuple[EdgeOn | None] | None] = Slot(lambda: None)
+#: Of one render call: spheres and cylinders of mirror or glass.
+EDGE_ON: Slot[EdgeOn | None] = Slot(lambda: None)
 
-#: Of one render call: light subpaths, in a tuple once they have been asked for.
-LIGHT: Slot[tuple[LightTechnique | None] | None] = Slot(lambda: None)
+#: Of one render call: light subpaths.
+LIGHT: Slot[LightTechnique | None] = Slot(lambda: None)
 
-#: Of one render call: rough glass whose index is differentiated, in a tuple once it has been looked for.
-CRITICAL: Slot[tuple[CriticalAngle | None] | None] = Slot(lambda: None)
+#: Of one render call: rough glass whose index is differentiated.
+CRITICAL: Slot[CriticalAngle | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,7 @@ class Job:
     @property
     def frame(self) -> SensorFrame:
         """Geometry of the sensor, read once per render call."""
-        if self.shared[FRAME] is None:
-            self.shared[FRAME] = sensor_frame(self.sensor)
-        return self.shared[FRAME]
+        return self.shared.once(FRAME, lambda: sensor_frame(self.sensor))
 
     @property
     def tubes(self) -> Tubes | None:
@@ -109,18 +107,14 @@ class Job:
         """Light subpaths, if the plan has any, set up once per render call."""
         if self.plan.light is None or not self.plan.light.runs:
             return None
-        if self.shared[LIGHT] is None:
-            self.shared[LIGHT] = (self._light_technique(),)
-        return self.shared[LIGHT][0]
+        return self.shared.once(LIGHT, self._light_technique)
 
     @property
     def critical(self) -> CriticalAngle | None:
         """Rough glass whose index of refraction is differentiated, read once per render call."""
         if not any(name.endswith(".eta") for shape in self.facts.shapes for name in shape.material):
             return None
-        if self.shared[CRITICAL] is None:
-            self.shared[CRITICAL] = (critical_angle(self.scene),)
-        return self.shared[CRITICAL][0]
+        return self.shared.once(CRITICAL, lambda: critical_angle(self.scene))
 
     @property
     def orbits(self) -> Orbits | None:
@@ -128,9 +122,7 @@ class Job:
         directions, and in other forms than the spatial one."""
         if self.form != "spatial" or self.light is not None:
             return None
-        if self.shared[ORBITS] is None:
-            self.shared[ORBITS] = (Orbits.of(self.scene, self.facts),)
-        return self.shared[ORBITS][0]
+        return self.shared.once(ORBITS, lambda: Orbits.of(self.scene, self.facts))
 
     def _light_technique(self) -> LightTechnique | None:
         plan = self.plan
@@ -149,16 +141,13 @@ class Job:
         """Limits of walks from beside an edge, which are compared."""
         if not self.facts.has_delta_lobes:
             return self.limits
-        if self.shared[EDGE_ON] is None:
-            self.shared[EDGE_ON] = (EdgeOn.of(self.scene, self.facts),)
-        return replace(self.limits, aligned=True, edge_on=self.shared[EDGE_ON][0])
+        edge_on = self.shared.once(EDGE_ON, lambda: EdgeOn.of(self.scene, self.facts))
+        return replace(self.limits, aligned=True, edge_on=edge_on)
 
 
 def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
     """The curves of the scene, read once per render call."""
-    if shared[TUBES] is None:
-        shared[TUBES] = (tubes_of(call.scene, facts, call.memory),)
-    return shared[TUBES][0]
+    return shared.once(TUBES, lambda: tubes_of(call.scene, facts, call.memory))
 
 
 def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:

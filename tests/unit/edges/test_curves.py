@@ -11,13 +11,13 @@ from psdr_jit.edges.curves import (
     CURVES_OF,
     PIECES,
     Curve,
-    attached_to_world,
     curve_point,
     curve_set,
     local_viewpoint,
     own_surface,
     transform_point,
 )
+from psdr_jit.scene.poses import attached_to_world
 
 N = 64
 VIEWS = {"point": (3.0, -1.5, 2.0, 1.0), "near": (1.2, 0.3, 0.4, 1.0), "direction": (0.6, 0.64, 0.48, 0.0)}
