@@ -54,6 +54,8 @@ class EdgeTopology:
     """Number of edges with more than two faces."""
     degenerate_faces: int
     """Number of faces left out because they have (nearly) no area."""
+    sliver_faces: int
+    """Number of those of them whose three corners are in different places, in a row."""
     duplicate_faces: int
     """Number of faces left out because another face has the same three corner positions."""
 
@@ -94,9 +96,7 @@ def weld_vertices(positions: np.ndarray, tolerance: float | None = None) -> np.n
     return distinct[connected_components(len(distinct), a, b)][np.searchsorted(distinct, rep)]
 
 
-def build_edge_topology(
-    positions: np.ndarray, faces: np.ndarray, tolerance: float | None = None
-) -> EdgeTopology:
+def build_edge_topology(positions: np.ndarray, faces: np.ndarray, tolerance: float | None = None) -> EdgeTopology:
     """Unique edges of a triangle soup and the faces that meet there.
 
     Args: `positions` (V, 3), `faces` (F, 3) integer, in any winding; `tolerance` as in `weld_vertices`.
@@ -108,7 +108,9 @@ def build_edge_topology(
         tolerance = WELD_TOLERANCE * _diagonal(positions)
     welded = weld_vertices(positions, tolerance)[faces]
 
-    sound = ~_is_degenerate(positions, welded, tolerance)
+    collapsed = ~_every(welded != np.roll(welded, -1, axis=1))
+    sliver = _is_sliver(positions, welded, tolerance) & ~collapsed
+    sound = ~(sliver | collapsed)
     kept = _first_of_duplicates(welded, np.flatnonzero(sound))
 
     # Half-edge h of kept face k: corners h % 3 and (h + 1) % 3 of face kept[h // 3].
@@ -124,6 +126,7 @@ def build_edge_topology(
         faces, kept, start, h0, h1,
         nonmanifold_edges=int(np.count_nonzero(count > 2)),
         degenerate_faces=int(len(faces) - np.count_nonzero(sound)),
+        sliver_faces=int(np.count_nonzero(sliver)),
         duplicate_faces=int(np.count_nonzero(sound) - len(kept)),
     )  # fmt: skip
 
@@ -199,8 +202,8 @@ def _diagonal(positions: np.ndarray) -> float:
     return float(np.linalg.norm([np.ptp(axis) for axis in positions.T]))  # ten times `np.ptp(axis=0)`
 
 
-def _is_degenerate(positions: np.ndarray, welded: np.ndarray, tolerance: float) -> np.ndarray:
-    """(F,) bool, faces with a repeated corner or a height below `tolerance`."""
+def _is_sliver(positions: np.ndarray, welded: np.ndarray, tolerance: float) -> np.ndarray:
+    """(F,) bool, faces with a height below `tolerance`."""
     a, b, c = (positions[welded[:, k]] for k in range(3))
     ab, ac, bc = (b - a).T, (c - a).T, (c - b).T
     x, y, z = ab
@@ -208,8 +211,7 @@ def _is_degenerate(positions: np.ndarray, welded: np.ndarray, tolerance: float) 
     double_area2 = (y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2
     ab2, ac2, bc2 = (sx * sx + sy * sy + sz * sz for sx, sy, sz in (ab, ac, bc))
     longest2 = np.maximum(np.maximum(ab2, ac2), bc2)
-    repeated = ~_every(welded != np.roll(welded, -1, axis=1))
-    return repeated | (double_area2 <= tolerance**2 * longest2)
+    return double_area2 <= tolerance**2 * longest2
 
 
 def _first_of_duplicates(welded: np.ndarray, candidates: np.ndarray) -> np.ndarray:

@@ -156,7 +156,7 @@ SUPPORT = (
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
-    Row("zero-area, duplicate and non-manifold faces", "warning", "named with their number"),
+    Row("non-manifold edges, duplicate and collapsed faces", "yes", "faces with three corners in a row: warning"),
     Row("meshes that cut into each other, a sphere in a mesh", "yes",
         "the curve where they meet, also of parts of one mesh; smooth-shaded lights that touch others, lights in "
         "windows or masks: warning"),

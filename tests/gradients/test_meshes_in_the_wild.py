@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from itertools import combinations
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -54,6 +57,18 @@ def stack() -> tuple[np.ndarray, np.ndarray]:
     return turned, np.concatenate([faces, faces + len(points)])
 
 
+def fins() -> tuple[np.ndarray, np.ndarray]:
+    """A block with a sheet on four of its edges, which have three faces then."""
+    points, faces = boxes(1)
+    ridges = [(i, j) for i, j in combinations(range(len(points)), 2)
+              if sum({i, j} <= set(face) for face in faces.tolist()) == 2]  # fmt: skip
+    for i, j in sorted(ridges, key=lambda ends: np.linalg.norm(points[ends[0]] - points[ends[1]]))[:4]:
+        middle, number = (points[i] + points[j]) / 2, len(points)
+        points = np.concatenate([points, points[[i, j]] + 0.4 * middle / np.linalg.norm(middle)])
+        faces = np.concatenate([faces, [(i, j, number + 1), (i, number + 1, number)]])
+    return points, faces
+
+
 def scene_of(points: np.ndarray, faces: np.ndarray) -> mi.Scene:
     """The mesh above a floor, under a lamp."""
     grey = {"type": "diffuse", "reflectance": 0.7}
@@ -79,12 +94,28 @@ def test_bodies_of_one_mesh_that_cut_into_each_other(llvm):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [stack, ribbon])
+@pytest.mark.parametrize("shape", [stack, ribbon, fins])
 def test_flush_bodies_and_a_surface_that_cuts_itself(llvm, shape):
-    """What two edges of a stack have in common is one edge; deep in a sharp corner it is not dark."""
+    """What two edges of a stack have in common is one edge, and so is where three faces meet; deep in a sharp corner it
+    is not dark."""
     motion = perturb(scene_of(*shape()), *MOVED)
     reference = fd(motion, SPEC, STEP, SEEDS, 4 * SPP)
     assert_grad_close(forward(motion, SPEC, SEEDS, SPP), reference, 0.01)
+
+
+@pytest.mark.parametrize("extra", ["again", "turned", "collapsed"])
+def test_faces_that_add_nothing_change_nothing(llvm, extra):
+    """Faces that repeat others, or have two corners in one place: no warning, and the derivative of the bare block."""
+    points, faces = boxes(1)
+    more = {"again": faces, "turned": faces[:, ::-1], "collapsed": faces[:, [0, 0, 1]]}[extra]
+    # Which face of two is met is a toss, and so are the random numbers of the interior term.
+    spec = {**SPEC, **{budget: SPP * (term != "interior") for term, budget in TERMS.items()}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = [forward(perturb(scene_of(points, f), *MOVED), spec, 1, SPP)
+                 for f in (faces, np.concatenate([faces, more]))]  # fmt: skip
+    assert np.abs(found[0]).max() > 0.1
+    assert np.allclose(*found, rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
 
 
 def test_a_mesh_that_is_mirrored_between_two_calls(llvm):

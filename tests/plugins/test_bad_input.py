@@ -277,11 +277,9 @@ def test_vertices_that_are_not_finite(bad):
             forward(load(m=triangles(points, TETRAHEDRON[1])), parameter)
 
 
-@pytest.mark.parametrize(("extra", "words"), [([0, 1, 1], "1 faces without area"), ([0, 2, 1], "1 faces that repeat"),
-                                              ([0, 1, 4], "1 edges with more than two faces")])  # fmt: skip
-def test_faces_without_a_place_in_a_surface(extra, words):
-    mesh = triangles([*TETRAHEDRON[0], [1, 1, 1]], [*TETRAHEDRON[1], extra])
-    with pytest.warns(UnsupportedWarning, match=words):
+def test_faces_with_their_corners_in_a_row():
+    mesh = triangles([*TETRAHEDRON[0], [0.5, 0, 0]], [*TETRAHEDRON[1], [0, 4, 1]])
+    with pytest.warns(UnsupportedWarning, match="1 faces without area"):
         assert np.isfinite(forward(load(m=mesh), "m.vertex_positions")).all()
 
 

@@ -81,7 +81,7 @@ def test_known_meshes(name):
 def test_uv_sphere_counts_the_collapsed_faces():
     p, f = oracle.uv_sphere(6, 8)
     topology = build_edge_topology(p, f)
-    assert topology.degenerate_faces == 2 * 8
+    assert (topology.degenerate_faces, topology.sliver_faces) == (2 * 8, 0)
     assert not topology.border.any()
 
 
@@ -192,6 +192,7 @@ def test_mesh_of_degenerate_faces_has_no_edges():
     p = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 0]], float)
     topology = build_edge_topology(p, np.array([[0, 1, 2], [0, 3, 1]]))
     assert (len(topology), topology.degenerate_faces) == (0, 2)
+    assert topology.sliver_faces == 1
 
 
 def test_a_hundred_thousand_triangles_take_a_fraction_of_a_second():
