@@ -224,7 +224,7 @@ def ball_mesh(centre: np.ndarray, radius: float, b: TriangleMesh, pieces: int) -
     box = np.stack([centre - radius, centre + radius])
     tol = tolerance(box, b.box)
     out = []
-    for f in in_box(b.positions, b.faces, box):
+    for f in _at_sphere(centre, radius, b, in_box(b.positions, b.faces, box), tol):
         corners = b.positions[b.faces[f]].astype(float)
         p, q, r = corners
         n = np.cross(q - p, r - p)
@@ -238,6 +238,19 @@ def ball_mesh(centre: np.ndarray, radius: float, b: TriangleMesh, pieces: int) -
     if not out:
         return Arcs(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     return Arcs(*(np.array(column) for column in zip(*out, strict=True)))
+
+
+def _at_sphere(centre: np.ndarray, radius: float, b: TriangleMesh, faces: np.ndarray, tol: float) -> np.ndarray:
+    """Those of the `faces` that the sphere may cut: neither all inside of it, nor farther from it than they are large.
+
+    Of a fine mesh inside of a large ball, or beside one, these are few, and what follows looks at them one by one.
+    """
+    corners = b.positions[b.faces[faces]].astype(float)
+    distance = np.linalg.norm(corners - centre, axis=2)
+    middle = corners.mean(1)
+    size = np.linalg.norm(corners - middle[:, None], axis=2).max(1)
+    outside = np.linalg.norm(middle - centre, axis=1) - size > radius + tol
+    return faces[(distance.max(1) >= radius - tol) & ~outside]
 
 
 def _inside_arcs(middle, size, n, corners, pieces: int):

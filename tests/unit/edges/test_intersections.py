@@ -107,6 +107,21 @@ def test_touching_ball():
     assert len(cut.ball_mesh(np.array([0, 0.8, 0]), 0.8, mesh(SQUARE, SQUARE_FACES), 64).face) == 0
 
 
+@pytest.mark.parametrize("distance", [0.0, 0.9, 1.1])
+def test_a_ball_looks_at_few_faces_of_a_fine_mesh(distance, monkeypatch):
+    """Around a ball of 16 000 faces, and through its side; looked at one by one, all of them take 30 s."""
+    points, faces = meshes.ball(64, 128)
+    unit = mesh((points - meshes.CENTRE) / meshes.RADIUS, faces)
+    looked, arcs_of = [], cut._inside_arcs
+    monkeypatch.setattr(cut, "_inside_arcs", lambda *args: looked.append(0) or arcs_of(*args))
+    found = cut.ball_mesh(np.array([distance, 0, 0]), 1.2, unit, 64)
+    height = (distance**2 + 1.2**2 - 1) / (2 * distance) if distance else 1.2  # of the circle's plane, from the ball
+    expected = 2 * np.pi * np.sqrt(1.2**2 - height**2)
+    half = np.linalg.norm(found.end - found.start, axis=1) / 2 / np.maximum(found.radius, 1e-9)
+    assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(expected, rel=0.01)
+    assert len(looked) < len(faces) / 20
+
+
 @pytest.mark.parametrize("spread", [0.02, 0.3])
 def test_near_pairs_are_all_that_overlap(spread):
     """Every pair of overlapping boxes, once, whether they are small or span most of the grid."""
