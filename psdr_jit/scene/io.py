@@ -45,6 +45,10 @@ def use_variant(name: str) -> None:
                          "'psdr doctor' says what is missing") from error
 
 
+#: Mesh files that an error lists, at most.
+LISTED = 5
+
+
 def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
     """Load a scene file with its shapes kept apart, so that their parameters keep their names.
 
@@ -65,7 +69,7 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
                              ) from error  # fmt: skip
         by_mesh = not text or "shape plugin" in text or isinstance(error, UnicodeDecodeError)
         if by_mesh and meshes and not any(mesh in text for mesh in meshes):
-            text += f" Is one of its mesh files empty or corrupt: {', '.join(meshes)}?"
+            text += f" Is one of its mesh files empty or corrupt: {_suspects(meshes, text)}?"
         raise SceneError(f"scene file '{path}' cannot be loaded: {text}") from error
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"scene file '{path}' holds a {type(scene).__name__}, not a scene: "
@@ -74,6 +78,13 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
         raise SceneError(f"scene file '{path}' has no <sensor>: there is no image to render")
     pad_curves(scene)
     return scene
+
+
+def _suspects(meshes: list[str], text: str) -> str:
+    """Those of the mesh files that Mitsuba's error names, as it does, without their folder; else the first of all."""
+    named = [mesh for mesh in meshes if f'"{Path(mesh).name}"' in text] or meshes
+    more = f" and {len(named) - LISTED} others" if len(named) > LISTED else ""
+    return ", ".join(named[:LISTED]) + more
 
 
 def _defaults(path: Path) -> str:
