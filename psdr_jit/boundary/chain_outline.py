@@ -29,7 +29,7 @@ from ..paths.delta_step import delta_step
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
-from ..scene.poses import attached_to_world
+from ..scene.poses import Poses
 from ..scene.registry import registry_values
 from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_trace import Pair
@@ -134,7 +134,7 @@ class AnalyticShapes:
             return None
         shapes = tuple(job.scene.shapes()[s.index] for s in chosen)
         number = registry_values(job.scene, {s.index: i + 1 for i, s in enumerate(chosen)})
-        columns = tuple(dr.detach(c) for c in attached_to_world(shapes, dr.arange(mi.UInt32, len(shapes))))
+        columns = Poses.of(shapes).at(dr.arange(mi.UInt32, len(shapes)))
         kind = mi.UInt32([list(CURVES_OF).index(s.plugin) for s in chosen])
         dr.eval(number, columns, kind)
         return AnalyticShapes(number, columns, kind)

@@ -33,6 +33,7 @@ def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> mi.Bool | None
         if _may_hide(job, body):
             inside = _is_inside(edge_shapes(job).shapes[body.index], body, rows, job.facts.reach)
             found = inside if found is None else found | inside
+            dr.eval(found)  # body by body in one kernel: together they would be one for every number of them
     return found
 
 

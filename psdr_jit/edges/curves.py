@@ -12,8 +12,10 @@ from enum import IntEnum
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..scene.poses import attached_to_world
+from ..core.upload import uploaded
+from ..scene.poses import Poses
 
 #: Each curve is cut into this many pieces, so that hidden or distant parts get their own weight.
 PIECES = 64
@@ -51,6 +53,7 @@ class CurveSet:
     shapes: tuple[mi.Shape, ...]
     pointers: mi.ShapePtr | None  # to `shapes`, for intersections
     rows: CurveRows | None
+    poses: Poses | None = None  # of `shapes`
 
 
 @dataclass
@@ -65,17 +68,14 @@ class CurvePoint:
 
 def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
     """Curves of `(shape, plugin name)` pairs."""
-    kind, owner, start = [], [], []
-    for i, (_, plugin) in enumerate(shapes):
-        for curve in CURVES_OF[plugin]:
-            kind += [int(curve)] * PIECES
-            owner += [i] * PIECES
-            start += [piece / PIECES for piece in range(PIECES)]
-    if not kind:
+    curves = np.array([(curve, i) for i, (_, plugin) in enumerate(shapes) for curve in CURVES_OF[plugin]])
+    if not len(curves):
         return CurveSet((), None, None)
-    rows = CurveRows(mi.UInt32(kind), mi.UInt32(owner), mi.Float(start))
+    kind, owner = (uploaded(mi.UInt32, np.repeat(column, PIECES)) for column in curves.T)
+    rows = CurveRows(kind, owner, uploaded(mi.Float, np.tile(np.arange(PIECES) / PIECES, len(curves))))
     owners = tuple(shape for shape, _ in shapes)
-    return CurveSet(owners, mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0]), rows)
+    pointers = mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0])
+    return CurveSet(owners, pointers, rows, Poses.of(owners))
 
 
 def transform_point(columns: tuple[mi.Vector3f, ...], x: mi.Point3f) -> mi.Point3f:
@@ -103,7 +103,7 @@ def curve_centre(kind: mi.UInt32) -> mi.Point3f:
 
 def curve_lengths(curves: CurveSet) -> mi.Float:
     """Approximate length of every piece [m] (a contour's depends on the viewpoint); detached."""
-    columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, curves.rows.shape))
+    columns = curves.poses.at(curves.rows.shape)
     line = (curves.rows.kind == int(Curve.CYLINDER_LEFT)) | (curves.rows.kind == int(Curve.CYLINDER_RIGHT))
     round_trip = dr.pi * (dr.norm(columns[0]) + dr.norm(columns[1]))
     return dr.select(line, dr.norm(columns[2]), round_trip) / PIECES

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.poses import attached_to_world
 from .curves import (
     PIECES,
     CurveRows,
@@ -42,7 +41,7 @@ class AnalyticCurves(ContourKind):
         return self.moves
 
     def places(self) -> mi.Point3f:
-        return mi.Point3f(dr.detach(attached_to_world(self.curves.shapes, self.curves.rows.shape)[3]))
+        return mi.Point3f(self.curves.poses.at(self.curves.rows.shape)[3])
 
     def line_weights(self, use: Use) -> mi.Float:
         return curve_lengths(self.curves) * dr.pi
@@ -50,7 +49,7 @@ class AnalyticCurves(ContourKind):
     def _columns(self, row: mi.UInt32, active: mi.Bool) -> tuple[CurveRows, tuple[mi.Vector3f, ...]]:
         """The rows, and the columns of their shapes' object-to-world maps, detached."""
         rows = dr.gather(CurveRows, self.curves.rows, row, active)
-        return rows, tuple(dr.detach(c) for c in attached_to_world(self.curves.shapes, rows.shape))
+        return rows, self.curves.poses.at(rows.shape)
 
     def inside(self, row: mi.UInt32, active: mi.Bool) -> mi.Point3f:
         rows, columns = self._columns(row, active)
@@ -102,5 +101,5 @@ class AnalyticCurves(ContourKind):
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""
         shape = dr.gather(mi.UInt32, self.curves.rows.shape, row, active)
-        x = transform_point(attached_to_world(self.curves.shapes, shape), dr.detach(at.local))
+        x = transform_point(self.curves.poses.attached_at(shape), dr.detach(at.local))
         return mi.Vector3f(x - dr.detach(x))

@@ -10,12 +10,12 @@ import mitsuba as mi
 from ..core.sensor_frame import SensorFrame
 from .coinciding import PointsBetween
 from .film_cover import EdgeOnFilm, straight_cover
+from .joined_meshes import attached_positions
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
 from .points import VISIBILITY_EPSILON, clearance, face_sides, step_past_lift
 from .rows import EdgeRows, face_uv
-from .segments import attached_positions
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
 
 

@@ -21,15 +21,15 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
-from ..scene.poses import attached_to_world
+from ..scene.poses import Poses
 from .curves import transform_point, transform_vector
 from .film_cover import LENS_CENTRE, PatchOnFilm, beside_film
+from .joined_meshes import attached_positions
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds
 from .location import EdgeLocation
 from .pattern_rows import PatternRows, PatternSet
 from .points import clearance, facing
-from .segments import attached_positions
 from .wedges import Wedges
 
 #: Sine of the angle at which all corners of a patch of a sphere turn away if all of the patch does.
@@ -244,17 +244,17 @@ class AnalyticPatterns(PatternLines):
     closed: mi.Bool  # by row: a sphere whose inside is never seen
 
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        columns = tuple(dr.detach(c) for c in attached_to_world(self.shapes, rows.shape))
+        columns = Poses.of(self.shapes).at(rows.shape)
         x, du, dv = surface_point(rows.part, q)
         return SurfacePoint(transform_point(columns, x), *(transform_vector(columns, d) for d in (du, dv)))
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        return transform_point(attached_to_world(self.shapes, rows.shape), surface_point(rows.part, q)[0])
+        return transform_point(Poses.of(self.shapes).attached_at(rows.shape), surface_point(rows.part, q)[0])
 
     def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         """The far side of a sphere of which the inside is never seen."""
         rows, eye = self.lines.rows, viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        centre = mi.Point3f(dr.detach(attached_to_world(self.shapes, rows.shape)[3]))
+        centre = mi.Point3f(Poses.of(self.shapes).at(rows.shape)[3])
         away = mi.Bool(self.closed)
         for x in corners:
             n, view = dr.normalize(x - centre), towards_viewer(eye, x)

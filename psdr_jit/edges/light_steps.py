@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.varying import varying
-from ..scene.poses import attached_to_world
+from ..scene.poses import Poses
 from .curves import transform_point, transform_vector
 from .light_step_rows import LightStepRows
 from .location import EdgeLocation
@@ -94,7 +94,7 @@ class LightSteps:
         rows = dr.gather(LightStepRows, self.rows, at.row)
         films = films_of(self.lights, self.far) if self.reshaped else self.films
         d, _, _ = _direction(rows, at.t, dr.gather(LightFilm, films, rows.light))
-        x = transform_point(attached_to_world(self.lights, rows.light), mi.Point3f(at.scale * d))
+        x = transform_point(Poses.of(self.lights).attached_at(rows.light), mi.Point3f(at.scale * d))
         return mi.Vector3f(x - dr.detach(x))
 
     def ray(self, row: mi.UInt32, t: mi.Float) -> LightRay:
@@ -102,7 +102,7 @@ class LightSteps:
         rows = dr.gather(LightStepRows, self.rows, row)
         films = dr.gather(LightFilm, self.films, rows.light)
         local = _direction(rows, t, films)
-        columns = tuple(dr.detach(c) for c in attached_to_world(self.lights, rows.light))
+        columns = Poses.of(self.lights).at(rows.light)
         w, dw, aside = (transform_vector(columns, v) for v in local)
         length = dr.norm(w)
         d = w / length

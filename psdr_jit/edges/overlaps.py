@@ -16,6 +16,9 @@ from .tessellation import cut_each_other
 #: Names of the pairs that have been warned about.
 SAID: Slot[set[tuple[str | int, str | int]]] = Slot(set)
 
+#: Pairs that a warning names, at most.
+NAMED = 3
+
 #: Shapes without triangles.
 ANALYTIC = ("disk", "cylinder", "sphere", "bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids")
 
@@ -49,10 +52,11 @@ def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:
 
 
 def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, int]], memory: Memory) -> None:
-    """Name those of `pairs` of `(shape, plugin)` that cut into each other along a curve that is not looked for, once.
+    """Warn once about those of `pairs` of `(shape, plugin)` that cut into each other along a curve not looked for.
 
     `pairs`: those whose boxes overlap.
     """
+    found = []
     for i, j in pairs:
         (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
@@ -61,14 +65,16 @@ def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, 
         key = (key_of(a), key_of(b))
         if not covered and key not in memory[SAID] and cut_each_other(shapes[i], shapes[j]):
             memory[SAID].add(key)
-            warnings.warn(
-                f"shapes '{shown_name(a)}' ({kind_a}) and '{shown_name(b)}' ({kind_b}) cut into each other: "
-                "the curve where they meet is found for meshes and for a sphere in a mesh only, its part of the "
-                "derivative is missing; "
-                "replace curved shapes by meshes",
-                UnsupportedWarning,
-                stacklevel=2,
-            )
+            found.append(f"'{shown_name(a)}' ({kind_a}) and '{shown_name(b)}' ({kind_b})")
+    if found:
+        others = f", and {len(found) - NAMED} other pairs" if len(found) > NAMED else ""
+        warnings.warn(
+            f"shapes {', '.join(found[:NAMED])}{others} cut into each other: the curve where they meet is found for "
+            "meshes and for a sphere in a mesh only, its part of the derivative is missing; replace curved shapes by "
+            "meshes",
+            UnsupportedWarning,
+            stacklevel=2,
+        )
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> bool:

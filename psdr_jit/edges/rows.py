@@ -38,22 +38,6 @@ class EdgeRows:
     corner1: mi.Vector2u
 
 
-def concatenate(parts: list[EdgeRows]) -> EdgeRows:
-    """All rows of several tables, in order."""
-    dr.eval(parts)  # at once: concatenation would evaluate column by column
-
-    def join(values):
-        first = values[0]
-        if dr.depth_v(first) == 1:
-            if dr.is_mask_v(first):  # concatenation moves numbers, not bits
-                return dr.concat([dr.select(v, mi.UInt32(1), 0) for v in values]) != 0
-            return dr.concat(values)
-        return type(first)(*(dr.concat([v[axis] for v in values]) for axis in range(len(first))))
-
-    fields = EdgeRows.__dataclass_fields__
-    return EdgeRows(**{name: join([getattr(part, name) for part in parts]) for name in fields})
-
-
 def face_uv(corners: mi.Vector2u, t: mi.Float) -> mi.Point2f:
     """Barycentric (b1, b2) of the point at parameter `t` between two corners of a face, as Mitsuba's `prim_uv`."""
 

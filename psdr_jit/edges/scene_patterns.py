@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, same_values, texcoords_buffer
+from ..core.joining import joined
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
@@ -31,13 +32,14 @@ from ..scene.patterns import (
 )
 from .curve_pattern_rows import curve_patterns
 from .edge_shapes import edge_shapes
+from .joined_meshes import attached_positions
 from .kind import EdgeKind
 from .kind_curve_pattern import RodPatterns, TubePatterns
 from .kind_pattern import AnalyticPatterns, MeshPatterns
 from .overlaps import apart
 from .pattern_rows import MOST_LINES, PatternSet, pattern_set, too_fine
 from .pattern_shapes import ShapePatterns, analytic_patterns, mesh_patterns, texture_reach
-from .segments import attached_positions, known_topology
+from .segments import known_topology
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,7 @@ def _seen_sides(
         first += facts.faces if facts.is_mesh else 1
     rows, are_meshes = lines.rows, any(facts.is_mesh for facts in chosen)
     face = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(firsts)), rows.shape)
-    closed = dr.gather(mi.Float, dr.concat(shells), face + rows.part if are_meshes else face)
+    closed = dr.gather(mi.Float, joined(shells), face + rows.part if are_meshes else face)
     side = dr.gather(mi.Float, uploaded(mi.Float, np.array(fronts)), rows.shape)
     front = dr.select((closed < 0) | (side < 0), mi.Float(0), 1)
     return front, dr.select((closed > 0) | (side > 0), mi.Float(0), 1)

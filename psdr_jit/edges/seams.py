@@ -36,9 +36,12 @@ def corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.
     return dr.select(corner == 0, tri.x, dr.select(corner == 1, tri.y, tri.z))
 
 
-def split_seams(mesh: mi.Mesh, painted: bool, topo: EdgeTopologyDevice) -> mi.Bool:
+def split_seams(mesh: mi.Mesh, painted: bool, topo: EdgeTopologyDevice, host: EdgeTopology) -> mi.Bool:
     """(E) edges along which shading normals, or what textures of a `painted` mesh look up at vertices, may jump."""
-    found, faces = dr.full(mi.Bool, False, dr.width(topo.v0)), mesh_faces(mesh)
+    found = dr.full(mi.Bool, False, dr.width(topo.v0))
+    if not host.split.any():
+        return found
+    faces = mesh_faces(mesh)
     ends = ((topo.v0, topo.corner1.x), (topo.v1, topo.corner1.y))
 
     def jumps(vertex_data) -> mi.Bool:
@@ -69,7 +72,7 @@ def charts(
 
     def make() -> tuple[np.ndarray, np.ndarray | None]:
         # what has been a seam stays one: normals that are computed anew come and go by rounding
-        seam = last[0] | np.array(dr.detach(split_seams(mesh, painted, device)))
+        seam = last[0] | np.array(dr.detach(split_seams(mesh, painted, device, host)))
         return last if (seam == last[0]).all() else (seam, face_charts(host, seam, mesh.face_count()))
 
     return while_unchanged(kept, key, list(mesh_buffers(mesh)), make)[1]

@@ -15,17 +15,18 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_values
+from ..core.joining import joined
 from ..core.memory import Memory, Slot, key_of
 from ..core.upload import uploaded
-from ..core.varying import varying
 from ..errors import SceneError, UnsupportedWarning
 from ..scene.names import shown_name
 from .coinciding import PointsBetween, divided, join_coinciding
 from .contacts import Contact, find_contacts
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
+from .joined_meshes import JoinedTopology, attached_positions, joined_faces, joined_topology
 from .junctions import JunctionTable, find_junctions
 from .parts import Part, parts_of
-from .rows import EdgeRows, concatenate
+from .rows import EdgeRows
 from .seams import corner_vertex, is_smooth, split_seams
 from .shells import edge_shells
 from .solids import Ball, Solid
@@ -50,6 +51,9 @@ class MeshTopology:
 
 #: By mesh and its numbers of vertices and faces.
 TOPOLOGIES: Slot[dict[tuple[str | int, int, int], MeshTopology]] = Slot(dict)
+
+#: The topologies of the last edge set, identified by their addresses, and joined.
+TOGETHER: Slot[tuple[list[int], list[MeshTopology], JoinedTopology] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -82,21 +86,19 @@ def edge_set(
     """
     if not meshes:
         return EdgeSet((), None, None, None)
-    parts, solids, first_vertex = [], [], 0
-    for i, mesh in enumerate(meshes):
-        positions = dr.detach(mesh_positions(mesh))
-        faces = mesh_faces(mesh)
-        dr.eval(positions, faces)  # as arrays in every call: kernels depend on whether they still have to be computed
-        topology = _cached_topology(mesh, positions, faces, memory)
-        jumps = split_seams(mesh, painted is None or painted[i], topology.device)
+    topologies = [_cached_topology(mesh, memory) for mesh in meshes]
+    jumps = []
+    for i, (mesh, topology) in enumerate(zip(meshes, topologies, strict=True)):
+        jump = split_seams(mesh, painted is None or painted[i], topology.device, topology.host)
         if seams is not None and seams[i] is not None:
-            jumps |= _on_sides(seams[i], topology.device)
-        parts.append(_rows(mesh, (positions, faces), topology, jumps, i, first_vertex, moving[i]))
-        solids.append(Solid(mesh, i, moving[i], topology.host, topology.shell, topology.parts))
-        first_vertex += dr.width(positions)
+            jump |= _on_sides(seams[i], topology.device)
+        jumps.append(jump)
+    solids = [Solid(mesh, i, moving[i], t.host, t.shell, t.parts)
+              for i, (mesh, t) in enumerate(zip(meshes, topologies, strict=True))]  # fmt: skip
     contacts = find_contacts(solids, memory)
-    rows = parts[0] if len(parts) == 1 else concatenate(parts)
-    rows, between, shared = divided(rows, solids, contacts, first_vertex)
+    rows = _rows(meshes, topologies, joined(jumps), moving, memory)
+    vertices = sum(mesh.vertex_count() for mesh in meshes)
+    rows, between, shared = divided(rows, solids, contacts, vertices)
     rows = join_coinciding(rows, moving, shared)
     junctions = find_junctions(solids, balls, memory)
     shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
@@ -104,26 +106,18 @@ def edge_set(
     return EdgeSet(tuple(meshes), rows, shapes, junctions, between, tuple(contacts))
 
 
-def attached_positions(meshes: tuple[mi.Mesh, ...]) -> mi.Point3f:
-    """Vertex positions of all meshes, attached, in the order of the global vertex indices."""
-    positions = [mesh_positions(mesh) for mesh in meshes]
-    if len(positions) == 1:
-        # Asked for twice, Dr.Jit 1.5 loses a part of the adjoint of one of two equal gathers; of products it does not.
-        return mi.Point3f(positions[0] * varying(mi.Float, 1))
-    return mi.Point3f(*(dr.concat([p[axis] for p in positions]) for axis in range(3)))
-
-
 def known_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
     """What `edge_set` has found out about `mesh` in this call, or what it would."""
     known = memory[TOPOLOGIES].get((key_of(mesh), mesh.vertex_count(), mesh.face_count()))
-    return known or _cached_topology(mesh, dr.detach(mesh_positions(mesh)), mesh_faces(mesh), memory)
+    return known or _cached_topology(mesh, memory)
 
 
-def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Memory) -> MeshTopology:
-    key = (key_of(mesh), dr.width(positions), dr.width(faces))
+def _cached_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
+    key = (key_of(mesh), mesh.vertex_count(), mesh.face_count())
     known = memory[TOPOLOGIES].get(key)
-    if known is not None and _still_holds(known, mesh, positions, faces):
+    if known is not None and _still_holds(known, mesh):
         return known
+    positions, faces = _arrays(mesh)
     p, f = np.array(positions).T, np.array(faces).T
     topology = build_edge_topology(p, f)
     warn_about_mesh(shown_name(mesh), topology)
@@ -134,7 +128,7 @@ def _cached_topology(mesh, positions: mi.Point3f, faces: mi.Vector3u, memory: Me
     shells = [uploaded(mi.Float, column) for column in (shell, facing)]
     known = MeshTopology(faces_buffer(mesh), topology, upload_topology(topology), *shells, parts_of(topology, f))
     memory[TOPOLOGIES][key] = known
-    _still_holds(known, mesh, positions, faces)  # true: its kernels are compiled now, not in the next call
+    _still_holds(known, mesh)  # true: its kernels are compiled now, not in the next call
     return known
 
 
@@ -154,12 +148,20 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
         warnings.warn(message, UnsupportedWarning, stacklevel=2)
 
 
-def _still_holds(known: MeshTopology, mesh: mi.Mesh, positions: mi.Point3f, faces: mi.Vector3u) -> bool:
+def _arrays(mesh: mi.Mesh) -> tuple[mi.Point3f, mi.Vector3u]:
+    """Vertices and faces, evaluated: kernels depend on whether they still have to be computed."""
+    positions, faces = dr.detach(mesh_positions(mesh)), mesh_faces(mesh)
+    dr.eval(positions, faces)
+    return positions, faces
+
+
+def _still_holds(known: MeshTopology, mesh: mi.Mesh) -> bool:
     if not same_values(known.faces, faces_buffer(mesh)):
         return False
     place, last = dr.detach(positions_buffer(mesh)), known.place
     if last is None or last.index != place.index:  # whatever writes to a mesh gives it another buffer
-        holds = _welds_hold(known.device, positions, faces) & _still_outward(known.facing, positions, faces)
+        arrays = _arrays(mesh)
+        holds = _welds_hold(known.device, *arrays) & _still_outward(known.facing, *arrays)
         known.place = place if bool(holds[0]) else None
     return known.place is not None
 
@@ -186,14 +188,20 @@ def _on_sides(sides: mi.Bool, topo: EdgeTopologyDevice) -> mi.Bool:
 
 
 def _rows(
-    mesh, geometry: tuple, topology: MeshTopology, jumps: mi.Bool, shape: int, first_vertex: int, moves: bool
+    meshes: list[mi.Mesh], topologies: list[MeshTopology], jumps: mi.Bool, moving: list[bool], memory: Memory
 ) -> EdgeRows:
-    (positions, faces), topo = geometry, topology.device
+    """One row per edge of each mesh, in order."""
+    together = _together(meshes, topologies, memory)
+    positions, faces, topo = dr.detach(attached_positions(meshes)), joined_faces(meshes), together.device
+    dr.eval(positions, faces, jumps)
     g = edge_geometry(positions, faces, topo)
-    n = dr.width(topo.v0)
+    shape, shell = together.shape, joined([topology.shell for topology in topologies])
+    smooth, moves = (dr.gather(mi.Bool, uploaded(mi.Bool, np.array(flags)), shape)
+                     for flags in ([is_smooth(mesh) for mesh in meshes], moving))  # fmt: skip
+    first_face = dr.gather(mi.UInt32, together.first_face, shape)
     return EdgeRows(
-        v0=topo.v0 + first_vertex,
-        v1=topo.v1 + first_vertex,
+        v0=mi.UInt32(topo.v0),
+        v1=mi.UInt32(topo.v1),
         p0=g.p0,
         p1=g.p1,
         n0=g.n0,
@@ -204,16 +212,26 @@ def _rows(
         inset1=g.inset1,
         border=mi.Bool(topo.border),  # copies: joining coinciding edges writes into rows
         seam=jumps | (g.angle > COPLANAR_ANGLE),
-        smooth=~jumps & is_smooth(mesh),
+        smooth=~jumps & smooth,
         pattern=jumps,
-        traced=dr.full(mi.Bool, False, n),
-        moves=dr.full(mi.Bool, moves, n),
-        shell0=topology.shell,
-        shell1=topology.shell,
-        shape0=dr.full(mi.UInt32, shape, n),
-        shape1=dr.full(mi.UInt32, shape, n),
-        prim0=topo.f0,
-        prim1=mi.UInt32(topo.f1),
+        traced=dr.full(mi.Bool, False, dr.width(topo.v0)),
+        moves=moves,
+        shell0=shell,
+        shell1=mi.Float(shell),
+        shape0=mi.UInt32(shape),
+        shape1=mi.UInt32(shape),
+        prim0=topo.f0 - first_face,
+        prim1=topo.f1 - first_face,
         corner0=topo.corner0,
         corner1=mi.Vector2u(topo.corner1),
     )
+
+
+def _together(meshes: list[mi.Mesh], topologies: list[MeshTopology], memory: Memory) -> JoinedTopology:
+    """The topologies as one, kept while each of them is."""
+    known = memory[TOGETHER]
+    if known is None or known[0] != [id(topology) for topology in topologies]:
+        found = joined_topology(meshes, [topology.host for topology in topologies])
+        known = ([id(topology) for topology in topologies], topologies, found)
+        memory[TOGETHER] = known
+    return known[2]

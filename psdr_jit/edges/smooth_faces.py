@@ -6,12 +6,15 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..core.compat import mesh_faces
+from ..core.joining import joined
 from ..core.memory import Memory
+from ..core.upload import uploaded
 from ..core.varying import varying
+from .joined_meshes import attached_positions, by_face, joined_faces
 from .seams import is_smooth
-from .segments import attached_positions, known_topology
+from .segments import known_topology
 
 
 @dataclass
@@ -53,26 +56,19 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
 
     `outside`, by mesh: 1 if a closed mesh is seen from outside only, else 0.
     """
-    parts, chosen, first = [], [], 0
-    for i, mesh in enumerate(meshes):
-        if not is_smooth(mesh):
-            continue
-        faces, topology = mesh_faces(mesh), known_topology(mesh, memory)
-        n = dr.width(faces)
-        parts.append(
-            FaceRows(
-                corner=faces + first,
-                shape=dr.full(mi.UInt32, len(chosen), n),
-                prim=dr.arange(mi.UInt32, n),
-                shell=topology.facing * dr.gather(mi.Float, outside, i),
-                moves=dr.full(mi.Bool, moving[i], n),
-            )
-        )
-        chosen.append(mesh)
-        first += mesh.vertex_count()
+    places = [i for i, mesh in enumerate(meshes) if is_smooth(mesh)]
+    chosen = [meshes[i] for i in places]
     if not chosen:
         return None
-    rows = parts[0] if len(parts) == 1 else _joined(parts)
+    shape, prim = by_face(chosen)
+    place = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(places)), shape)
+    rows = FaceRows(
+        corner=joined_faces(chosen),
+        shape=shape,
+        prim=prim,
+        shell=joined([known_topology(mesh, memory).facing for mesh in chosen]) * dr.gather(mi.Float, outside, place),
+        moves=dr.gather(mi.Bool, uploaded(mi.Bool, np.array(moving)), place),
+    )
     shapes = mi.ShapePtr(chosen) if len(chosen) > 1 else mi.ShapePtr(chosen[0])
     found = SmoothFaces(
         tuple(chosen), shapes, rows, dr.detach(attached_positions(tuple(chosen))), dr.detach(_normals(tuple(chosen)))
@@ -81,20 +77,12 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
     return found
 
 
-def _joined(parts: list[FaceRows]) -> FaceRows:
-    dr.eval(parts)
-    moves = dr.concat([dr.select(part.moves, mi.UInt32(1), 0) for part in parts]) != 0
-    corner = mi.Vector3u(*(dr.concat([part.corner[axis] for part in parts]) for axis in range(3)))
-    shape, prim, shell = (dr.concat([getattr(p, name) for p in parts]) for name in ("shape", "prim", "shell"))
-    return FaceRows(corner, shape, prim, shell, moves)
-
-
 def _normals(meshes: tuple[mi.Mesh, ...]) -> mi.Normal3f:
     """Shading normals of all vertices, attached."""
     parts = [mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())) for mesh in meshes]
     if len(parts) == 1:
         return mi.Normal3f(parts[0])
-    return mi.Normal3f(*(dr.concat([part[axis] for part in parts]) for axis in range(3)))
+    return mi.Normal3f(*(joined([part[axis] for part in parts]) for axis in range(3)))
 
 
 def _gathered(positions: mi.Point3f, normals: mi.Normal3f, corner: mi.Vector3u, active: mi.Bool):

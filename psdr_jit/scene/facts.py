@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -118,48 +119,48 @@ class SceneFacts:
     def camera_moves(self) -> bool:
         return bool(self.sensor.pose)
 
-    @property
+    @cached_property
     def shapes_move(self) -> bool:
         return any(shape.moves for shape in self.shapes)
 
-    @property
+    @cached_property
     def emitters_move(self) -> bool:
         """A light without a shape changes its pose. A moving area light counts as a moving shape."""
         return any(emitter.pose for emitter in self.emitters)
 
-    @property
+    @cached_property
     def paths_bend(self) -> bool:
         """Directions behind delta lobes turn: an index of refraction depends on θ."""
         return any(shape.bends for shape in self.shapes)
 
-    @property
+    @cached_property
     def geometry_moves(self) -> bool:
         """Paths and discontinuities may move: a shape, a light's pose, the camera or refraction depends on θ."""
         return self.shapes_move or self.emitters_move or self.camera_moves or self.paths_bend
 
-    @property
+    @cached_property
     def has_delta_emitters(self) -> bool:
         return any(emitter.delta for emitter in self.emitters)
 
-    @property
+    @cached_property
     def has_delta_lobes(self) -> bool:
         return any(shape.delta_lobes for shape in self.shapes)
 
-    @property
+    @cached_property
     def scatters(self) -> bool:
         """Some surface sends light in more directions than its delta lobes have."""
         return any(shape.bsdf_flags & int(mi.BSDFFlags.Smooth) and not shape.black for shape in self.shapes)
 
-    @property
+    @cached_property
     def has_light_steps(self) -> bool:
         """Some light throws steps of its own on the surfaces: a picture, or a cone with a hard rim."""
         return any(emitter.steps for emitter in self.emitters)
 
-    @property
+    @cached_property
     def has_infinite_emitters(self) -> bool:
         return any(emitter.infinite for emitter in self.emitters)
 
-    @property
+    @cached_property
     def has_area_emitters(self) -> bool:
         return any(emitter.shape >= 0 for emitter in self.emitters)
 

@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import mesh_positions
+from ..core.compat import positions_buffer
+from ..core.joining import joined
 from .capabilities import FRAME_FREE_PLUGINS, GRID_SHAPES, JUMPING_PLUGINS
 from .names import plugin_name, traverse
 from .params import parameter_value
@@ -255,16 +256,13 @@ def non_finite_vertices(shapes: list[mi.Shape]) -> list[int]:
     result = [0] * len(shapes)
     if not meshes or dr.flag(dr.JitFlag.FreezingScope):  # values cannot be read while freezing
         return result
-    counts = [dr.count(~_all_finite(mesh_positions(shapes[i]))) for i in meshes]
-    dr.eval(counts)
-    for i, count in zip(meshes, np.array(dr.concat(counts)), strict=True):
-        result[i] = int(count)
+    finite = dr.isfinite(joined([dr.detach(positions_buffer(shapes[i])) for i in meshes]))
+    if bool(dr.all(finite)[0]):
+        return result
+    end = np.cumsum([shapes[i].vertex_count() for i in meshes])
+    for i, of_mesh in zip(meshes, np.split(np.array(finite).reshape(-1, 3), end[:-1]), strict=True):
+        result[i] = int(np.count_nonzero(~of_mesh.all(axis=1)))
     return result
-
-
-def _all_finite(p: mi.Point3f) -> mi.Bool:
-    p = dr.detach(p)
-    return dr.isfinite(p.x) & dr.isfinite(p.y) & dr.isfinite(p.z)
 
 
 def _host(value) -> np.ndarray | None:

@@ -3,20 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.joining import joined
 
-def attached_to_world(shapes: tuple[mi.Shape, ...], index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
-    """Columns (x, y, z axis, origin) of each lane's object-to-world map, attached to the shapes' `to_world`."""
-    matrices = [mi.traverse(shape)["to_world"].matrix for shape in shapes]
 
-    def column(j: int) -> mi.Vector3f:
-        entries = (dr.concat([mi.Float(m[i, j]) for m in matrices]) for i in range(3))
-        return mi.Vector3f(*(dr.gather(mi.Float, entry, index) for entry in entries))
+@dataclass(frozen=True)
+class Poses:
+    """Object-to-world maps (x, y, z axis, origin) of several shapes or lights, read once."""
 
-    return tuple(column(j) for j in range(4))
+    matrices: tuple[mi.Matrix4f, ...]  # attached to the shapes' `to_world`
+    entries: tuple[tuple[mi.Float, ...], ...]  # by column and row, one value for each shape; detached
+
+    @staticmethod
+    def of(shapes: Sequence[mi.Object]) -> Poses:
+        matrices = tuple(mi.traverse(shape)["to_world"].matrix for shape in shapes)
+        entries = tuple(
+            tuple(joined([dr.detach(mi.Float(m[i, j])) for m in matrices]) for i in range(3)) for j in range(4)
+        )
+        dr.eval(entries)
+        return Poses(matrices, entries)
+
+    def at(self, index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
+        """Of each lane's shape, detached."""
+        return tuple(mi.Vector3f(*(dr.gather(mi.Float, entry, index) for entry in column)) for column in self.entries)
+
+    def attached_at(self, index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
+        """Of each lane's shape, attached."""
+        moving = [k for k, matrix in enumerate(self.matrices) if dr.grad_enabled(matrix)]
+        if not moving:
+            return self.at(index)
+
+        def entry(i: int, j: int) -> mi.Float:
+            values = mi.Float(self.entries[j][i])
+            for k in moving:
+                dr.scatter(values, mi.Float(self.matrices[k][i, j]), mi.UInt32(k))
+            return dr.gather(mi.Float, values, index)
+
+        return tuple(mi.Vector3f(*(entry(i, j) for i in range(3))) for j in range(4))
 
 
 def spheres_of(scene: mi.Scene, indices: Sequence[int]) -> tuple[mi.Point3f, mi.Float]:
@@ -26,7 +53,7 @@ def spheres_of(scene: mi.Scene, indices: Sequence[int]) -> tuple[mi.Point3f, mi.
     """
     shapes = scene.shapes()
     found = tuple(shapes[index] for index in indices)
-    x_axis, _, _, centre = attached_to_world(found, dr.arange(mi.UInt32, len(found)))
-    centres, radii = mi.Point3f(dr.detach(centre)), dr.detach(dr.norm(x_axis))
+    x_axis, _, _, centre = Poses.of(found).at(dr.arange(mi.UInt32, len(found)))
+    centres, radii = mi.Point3f(centre), dr.norm(x_axis)
     dr.make_opaque(centres, radii)
     return centres, radii

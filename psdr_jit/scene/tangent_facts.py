@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.ad import tangents
 from ..core.compat import VERTEX_NORMALS, mesh_positions
+from ..core.joining import joined
 from .facts import SceneFacts, analyse
 
 #: Deviation from a common rigid motion that counts as rounding, relative to the largest speed.
@@ -45,7 +46,7 @@ def vertex_speeds(meshes: tuple[mi.Mesh, ...]) -> mi.Float:
     with dr.resume_grad():
         velocities = tangents(*(mesh_positions(mesh) for mesh in meshes))
     velocities = velocities if len(meshes) > 1 else (velocities,)
-    return dr.concat([dr.norm(mi.Vector3f(v)) for v in velocities])
+    return joined([dr.norm(mi.Vector3f(v)) for v in velocities])
 
 
 def moves_as_one(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts) -> bool:

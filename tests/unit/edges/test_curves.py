@@ -17,7 +17,6 @@ from psdr_jit.edges.curves import (
     own_surface,
     transform_point,
 )
-from psdr_jit.scene.poses import attached_to_world
 
 N = 64
 VIEWS = {"point": (3.0, -1.5, 2.0, 1.0), "near": (1.2, 0.3, 0.4, 1.0), "direction": (0.6, 0.64, 0.48, 0.0)}
@@ -95,7 +94,7 @@ def test_world_points_lie_on_the_shape(variant, plugin):
         "type": plugin, "to_world": T().translate([0.3, -0.2, 0.5]).rotate([2 / 3, 2 / 3, 1 / 3], 40).scale(0.7)
     })  # fmt: skip
     curves = curve_set([(shape, plugin)])
-    columns = tuple(dr.detach(c) for c in attached_to_world(curves.shapes, curves.rows.shape))
+    columns = curves.poses.at(curves.rows.shape)
     local = local_viewpoint(columns, mi.Vector4f(2, 1, 3, 1))
     p = curve_point(curves.rows.kind, curves.rows.start + 0.3 / PIECES, local)
     eye = np.array(transform_point(columns, mi.Point3f(local.x, local.y, local.z))).T
