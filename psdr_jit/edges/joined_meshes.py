@@ -69,7 +69,8 @@ def joined_topology(meshes: Sequence[mi.Mesh], topologies: Sequence[EdgeTopology
     border = together["f1"] == INVALID
     together["f0"] = together["f0"] + face
     together["f1"] = np.where(border, INVALID, together["f1"] + face)
-    found = EdgeTopology(**together, nonmanifold_edges=0, degenerate_faces=0, sliver_faces=0, duplicate_faces=0)
+    counts = dict(nonmanifold_edges=0, degenerate_faces=0, sliver_faces=0, sliver_share=0.0, duplicate_faces=0)
+    found = EdgeTopology(**together, **counts)  # what is said of them has been said of each
     shape = uploaded(mi.UInt32, np.repeat(np.arange(len(edges)), edges))
     return JoinedTopology(upload_topology(found), shape, uploaded(mi.UInt32, faces))
 

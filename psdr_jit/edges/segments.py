@@ -35,6 +35,9 @@ from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
 
+#: Share of faces without area among a mesh's edges, by length, up to which what they do is not seen.
+FEW_SLIVERS = 0.01
+
 
 @dataclass
 class MeshTopology:
@@ -141,7 +144,7 @@ def warn_about_mesh(name: str, topology: EdgeTopology) -> None:
     """
     if len(topology) == 0:
         raise SceneError(f"mesh '{name}' has no face with an area; remove it or fix its file")
-    if topology.sliver_faces:
+    if topology.sliver_share > FEW_SLIVERS:
         message = (f"mesh '{name}' has {topology.sliver_faces} faces without area, their corners in a row: rays along "
                    "one of them meet it at any distance, which takes some 3 % of the derivative of outlines there; "
                    "remove these faces")  # fmt: skip

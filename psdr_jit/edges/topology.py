@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 
 from ..errors import SceneError
+from .slivers import is_sliver, share_of_edges
 
 INVALID = np.uint32(0xFFFFFFFF)
 """Face index that stands for "no face" in `EdgeTopology.f1`."""
@@ -56,6 +57,8 @@ class EdgeTopology:
     """Number of faces left out because they have (nearly) no area."""
     sliver_faces: int
     """Number of those of them whose three corners are in different places, in a row."""
+    sliver_share: float
+    """Their lengths, relative to those of all edges."""
     duplicate_faces: int
     """Number of faces left out because another face has the same three corner positions."""
 
@@ -109,7 +112,7 @@ def build_edge_topology(positions: np.ndarray, faces: np.ndarray, tolerance: flo
     welded = weld_vertices(positions, tolerance)[faces]
 
     collapsed = ~_every(welded != np.roll(welded, -1, axis=1))
-    sliver = _is_sliver(positions, welded, tolerance) & ~collapsed
+    sliver = is_sliver(positions, welded, tolerance) & ~collapsed
     sound = ~(sliver | collapsed)
     kept = _first_of_duplicates(welded, np.flatnonzero(sound))
 
@@ -127,6 +130,7 @@ def build_edge_topology(positions: np.ndarray, faces: np.ndarray, tolerance: flo
         nonmanifold_edges=int(np.count_nonzero(count > 2)),
         degenerate_faces=int(len(faces) - np.count_nonzero(sound)),
         sliver_faces=int(np.count_nonzero(sliver)),
+        sliver_share=share_of_edges(positions, welded[sliver], start, end) if sliver.any() else 0.0,
         duplicate_faces=int(np.count_nonzero(sound) - len(kept)),
     )  # fmt: skip
 
@@ -200,18 +204,6 @@ def _diagonal(positions: np.ndarray) -> float:
     if len(positions) == 0:
         return 0.0
     return float(np.linalg.norm([np.ptp(axis) for axis in positions.T]))  # ten times `np.ptp(axis=0)`
-
-
-def _is_sliver(positions: np.ndarray, welded: np.ndarray, tolerance: float) -> np.ndarray:
-    """(F,) bool, faces with a height below `tolerance`."""
-    a, b, c = (positions[welded[:, k]] for k in range(3))
-    ab, ac, bc = (b - a).T, (c - a).T, (c - b).T
-    x, y, z = ab
-    u, v, w = ac
-    double_area2 = (y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2
-    ab2, ac2, bc2 = (sx * sx + sy * sy + sz * sz for sx, sy, sz in (ab, ac, bc))
-    longest2 = np.maximum(np.maximum(ab2, ac2), bc2)
-    return double_area2 <= tolerance**2 * longest2
 
 
 def _first_of_duplicates(welded: np.ndarray, candidates: np.ndarray) -> np.ndarray:
