@@ -270,4 +270,5 @@ TERM = Term(
     backward=backward,
     edges=EdgeSampling(film_weights, "the others rest, are coplanar, turn away or leave the film"),
     guided=1,
+    covers=True,
 )

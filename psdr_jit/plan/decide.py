@@ -8,7 +8,7 @@ from ..options import Options
 from ..scene.facts import SceneFacts
 from .light_plan import LightPlan
 from .plan import SWITCHED_OFF, Geometry, Plan, TermPlan
-from .reasons import nothing_to_compute
+from .reasons import NO_LIGHT, nothing_to_compute
 from .term import Term, Verdict
 
 #: Segments of a path that count when its cost is estimated: deeper ones are rare or dim.
@@ -27,6 +27,8 @@ def _verdict(term: Term, facts: SceneFacts, options: Options, geometry: Geometry
     if options.plan == "full":
         return True, "the planner is off"
     nothing = nothing_to_compute(facts, options)
+    if not facts.emitters and not term.covers:
+        nothing = nothing or NO_LIGHT
     return term.needed(facts, options, geometry) if nothing is None else (False, nothing)
 
 

@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from ..options import Options
 from ..scene.facts import SceneFacts
 
+#: Why all is black; the film's alpha channel is not.
+NO_LIGHT = "the scene has no light source"
+
 
 def nothing_to_compute(facts: SceneFacts, options: Options) -> str | None:
     """Why the whole derivative is 0, if it is."""
@@ -18,8 +21,8 @@ def _nothing(facts: SceneFacts, options: Options) -> Iterator[str]:
         yield facts.still or "no parameter of the scene has gradients enabled"
     elif options.depth_limit == 0:
         yield "max_depth = 0: paths without a segment carry no light"
-    elif not facts.emitters:
-        yield "the scene has no light source"
+    elif not facts.emitters and not facts.sensor.coverage:
+        yield NO_LIGHT
     elif not _relevant(facts):
         yield "what has gradients enabled does not enter the image of this sensor"
 

@@ -48,4 +48,5 @@ class Term:
     guided: int = 0  # random numbers of a sample that a guide may choose: 3 of a line through an edge, 1 of a point
     with_light: float = 1.0  # factor on the cost where light subpaths run
     over_film: bool = False  # its samples begin at points of the film: there may be more where it is noisy
+    covers: bool = False  # it changes the coverage of the film as well, without any light
     cost_of_segment: float | None = None  # as `cost`, if samples tell how much they trace (`Job.effort`)

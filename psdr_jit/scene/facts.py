@@ -95,6 +95,7 @@ class SensorFacts:
     has_medium: bool
     shutter_open_time: float  # [s]
     pose: tuple[str, ...]  # enabled parameters: pose and intrinsics, neither film nor sampler
+    coverage: bool  # its film has an alpha channel
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ def _sensor_facts(graph: SceneGraph, sensor: mi.Sensor) -> SensorFacts:
         plugin=plugin_name(sensor),
         has_medium=sensor.get_medium() is not None,
         shutter_open_time=float(sensor.shutter_open_time()),
-        pose=graph.enabled_of(sensor)
-        + graph.enabled_below(sensor, skip=(mi.Film, mi.Sampler, mi.Medium, mi.Shape)),
+        pose=graph.enabled_of(sensor) + graph.enabled_below(sensor, skip=(mi.Film, mi.Sampler, mi.Medium, mi.Shape)),
+        coverage=mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha),
     )
 

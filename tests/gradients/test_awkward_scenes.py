@@ -233,3 +233,21 @@ def test_a_spherical_light_that_is_turned(llvm):
     straight, turned = shadow(T()), shadow(T().rotate([0.6, 0, 0.8], 140))
     slope = gain(turned, straight[::2], straight[1::2])
     assert abs(slope.value - 1) < 4 * slope.stderr and slope.stderr < 0.03
+
+
+def test_coverage_needs_no_light(llvm):
+    """A card of 4 x 4 units on a film of 16 x 16 px that shows 2 x 2, its left edge in the middle: moved to the right by
+    x it covers 8 x 16 px less per unit; all of it in the alpha channel, in the columns beside that edge.
+    """
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
+    view = {
+        "type": "orthographic",
+        "film": film,
+        "to_world": T().look_at(origin=[0, 0, 3], target=[0, 0, 0], up=[0, 1, 0]),
+    }
+    dark = scene(camera=view, card={"type": "rectangle", "to_world": T().translate([2, 0, 0]).scale(2)})
+    for moved, expected in (("card.to_world", -8 * 16), ("camera.to_world", 8 * 16)):
+        found = forward(perturb(dark, moved, X), {"type": "psdr_path", "max_depth": 2}, 2, 16).mean(0)
+        assert (found[..., :3] == 0).all()
+        assert found[..., 3].sum() == pytest.approx(expected, rel=0.02)
+        assert np.abs(found[:, 7:9, 3]).sum() == pytest.approx(np.abs(found[..., 3]).sum())
