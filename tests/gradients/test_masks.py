@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+import pytest
 from helpers import assert_grad_close, forward
 
 from psdr_jit.derivative import integrator_specs
@@ -51,6 +52,7 @@ def test_a_sun_that_turns(llvm):
     np.testing.assert_allclose(2 * masked.mean(0), opaque.mean(0), rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_shadow_behind_a_mask(llvm):
     """Shadow edges on the wall, seen straight through flat faces, whose normals follow nothing."""
 

@@ -72,20 +72,17 @@ def assert_alike(mirrored: tuple, behind: tuple) -> None:
     assert np.abs(mirrored[0] - behind[0]).max() < 0.01 * size + 4 * error.max()
 
 
-@pytest.mark.parametrize(
-    ("eye", "direction"), [(ABOVE, (0.6, 0.6, 0.5)), pytest.param(ASIDE, (1, 0, 0), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("eye", "direction"), [(ABOVE, (0.6, 0.6, 0.5)), (ASIDE, (1, 0, 0))])
 def test_a_spot_in_a_mirror_is_one_behind_it(llvm, eye, direction):
     mirrored = blocks(scene(True, eye), "receiver.vertex_positions", direction, type="psdr_bdpt", max_depth=3)
     assert_alike(mirrored, blocks(scene(False, eye), "receiver.vertex_positions", direction, max_depth=2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("param", "direction", "of_image"),
-    [
-        pytest.param("lamp.to_world", (0.5, 0.4, 0.3), (-0.5, 0.4, 0.3), marks=pytest.mark.slow),
-        ("mirror.to_world", (1, 0, 0), (2, 0, 0)),
-    ],
+    [("lamp.to_world", (0.5, 0.4, 0.3), (-0.5, 0.4, 0.3)), ("mirror.to_world", (1, 0, 0), (2, 0, 0))],
 )
 def test_a_hard_rim_moves_with_lamp_and_mirror(llvm, param, direction, of_image):
     mirrored = blocks(scene(True, ABOVE, HARD), param, direction, type="psdr_bdpt", max_depth=3)

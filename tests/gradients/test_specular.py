@@ -108,6 +108,7 @@ def test_what_is_not_there_casts_no_shadow(llvm):
     assert_grad_close(-indirect, direct, max_stderr=0.03)
 
 
+@pytest.mark.slow
 def test_glass_that_cuts_into_a_floor(llvm):
     """Right above the cut, what leaves the glass starts below the floor: it must not see the sky there."""
     pose = T().translate([0.1, 0, 0.1]).rotate([0.6, 0.8, 0.3], 40).scale(0.4)
