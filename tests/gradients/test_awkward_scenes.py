@@ -236,8 +236,8 @@ def test_a_spherical_light_that_is_turned(llvm):
 
 
 def test_coverage_needs_no_light(llvm):
-    """A card of 4 x 4 units on a film of 16 x 16 px that shows 2 x 2, its left edge in the middle: moved to the right by
-    x it covers 8 x 16 px less per unit; all of it in the alpha channel, in the columns beside that edge.
+    """A card of 4 x 4 units on a film of 16 x 16 px that shows 2 x 2, its left edge in the middle: moved to the right
+    it covers 8 x 16 px less per unit; all of it in the alpha channel, in the columns beside that edge.
     """
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "rgba"}
     view = {
