@@ -23,6 +23,7 @@ from ..core.upload import uploaded
 from ..errors import UnsupportedWarning
 from ..scene.names import shown_name
 from . import intersections as cut
+from .moved_along import segments_moved_along
 from .overlaps import box_of, crossing
 from .parts import crosses_itself, cut_parts
 from .rows import EdgeRows
@@ -83,7 +84,7 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
         state = (state_of(a), state_of(b))
         known = memory[PAIRS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
-            known = (state, _within(a, memory) if a is b else _pair(a, b))
+            known = (state, _within(a, memory) if a is b else _pair(a, b, memory))
             memory[PAIRS][key] = known
             changed = True
         if known[1] is not None:
@@ -126,7 +127,7 @@ def _crosses(solid: Solid) -> bool:
         return False
 
 
-def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
+def _pair(a: Solid, b: Solid | Ball, memory: Memory) -> tuple | None:
     """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
     mesh_a = triangles(a)
     if isinstance(b, Ball):
@@ -141,7 +142,7 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
         return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
     mesh_b = triangles(b)
     try:
-        found = cut.mesh_mesh(mesh_a, mesh_b)
+        found = segments_moved_along((a, mesh_a), (b, mesh_b), memory, lambda: cut.mesh_mesh(mesh_a, mesh_b))
     except cut.TooManyPairs:
         return _too_many(f"shapes '{shown_name(a.mesh)}' and '{shown_name(b.mesh)}'")
     return _between(a, mesh_a, b, mesh_b, found)
@@ -150,8 +151,12 @@ def _pair(a: Solid, b: Solid | Ball) -> tuple | None:
 def _within(solid: Solid, memory: Memory) -> tuple | None:
     """As `_pair`, of the surfaces that one mesh consists of, or of one that cuts itself."""
     mesh = triangles(solid)
+
+    def look() -> cut.Segments:
+        return cut.mesh_itself(mesh) if _cuts_itself(solid, memory) else cut_parts(mesh, solid.parts)
+
     try:
-        found = cut.mesh_itself(mesh) if _cuts_itself(solid, memory) else cut_parts(mesh, solid.parts)
+        found = segments_moved_along((solid, mesh), (solid, mesh), memory, look)
     except cut.TooManyPairs:
         return _too_many(f"parts of shape '{shown_name(solid.mesh)}'")
     return _between(solid, mesh, solid, mesh, found)
