@@ -3,8 +3,9 @@
 Steps are looked at a little beside an edge. A distance s inside of the outline of a sphere of radius R, its surface is
 met at the cosine c = √(2 s/R), which falls much more slowly than s: what is 10⁻⁴ R off the outline is met at .014. Most
 surfaces are the same there, but smooth glass with its reflectance 1 − O(c) (Fresnel) has left the limit 1 by 7 % then.
-The interior term has the whole fall from 1, up to where it ends (`GRAZING`); a step with less than the limit
-would have a part of it twice. So walks from beside an edge meet such a surface at that cosine.
+The interior term has the whole fall from 1, up to where it ends (`GRAZING`); a step with less than the limit would have
+a part of it twice. So walks from beside an edge meet such a surface at that cosine, and in the point of contact: what
+is mirrored goes straight on there, which from the point that was met leads through the surface once more.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..core.upload import uploaded
 from ..scene.facts import SceneFacts
-from ..scene.registry import registry_table
+from ..scene.poses import Poses
+from ..scene.registry import registry_values
 
 #: Cosine of arrival below which a vertex has no derivative. A sliding vertex moves by 1/cosθ, and at the outline of a
 #: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
@@ -32,26 +36,42 @@ BESIDE = 0.05
 class EdgeOn:
     """The shapes of a scene of which this is so. Host object."""
 
-    shapes: mi.UInt32  # by registry index: 1 if it is one of them
+    place: mi.UInt32  # by registry index of a shape: 1 + its place below, 0: it is none of these
+    radius: mi.Float  # [m]
+    axis: mi.Vector3f  # of a cylinder, of unit length; 0 of a sphere
 
     @staticmethod
     def of(scene: mi.Scene, facts: SceneFacts) -> EdgeOn | None:
         """None where there are none."""
-        found = {s.index for s in facts.shapes if s.index >= 0 and s.plugin in ROUND and s.delta_lobes}
-        return EdgeOn(registry_table(scene, found)) if found else None
+        chosen = [s for s in facts.shapes if s.index >= 0 and s.plugin in ROUND and s.delta_lobes]
+        if not chosen:
+            return None
+        place = registry_values(scene, {s.index: i + 1 for i, s in enumerate(chosen)})
+        shapes = scene.shapes()
+        x_axis, _, z_axis, _ = Poses.of([shapes[s.index] for s in chosen]).at(dr.arange(mi.UInt32, len(chosen)))
+        long = uploaded(mi.Float, np.array([s.plugin == "cylinder" for s in chosen]))
+        found = EdgeOn(place, dr.norm(x_axis), long * dr.normalize(z_axis))
+        dr.eval(found.place, found.radius, found.axis)
+        return found
 
     def at_limit(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        """`si`, which a ray along `d` meets, with the normal of the outline where it lies on one. Detached.
+        """`si`, which a ray along `d` meets, at the point and with the normal of the outline where it lies beside one.
+        Detached.
 
         What is mirrored there then goes straight on, by 2 `GRAZING` radians.
         """
         code = dr.reinterpret_array(mi.UInt32, si.shape)
         cos = dr.dot(si.sh_frame.n, -d)
         at_outline = active & si.is_valid() & (dr.abs(cos) < BESIDE)
-        at_outline &= dr.gather(mi.UInt32, self.shapes, code, at_outline & (code < dr.width(self.shapes))) != 0
-        across = dr.normalize(si.sh_frame.n + cos * d)
-        n = mi.Normal3f(dr.sqrt(1 - GRAZING**2) * across - dr.mulsign(GRAZING, cos) * d)
+        place = dr.gather(mi.UInt32, self.place, code, at_outline & (code < dr.width(self.place)))
+        at_outline &= place != 0
+        axis = dr.gather(mi.Vector3f, self.axis, place - 1, at_outline)
+        d_across = d - axis * dr.dot(axis, d)
+        contact = dr.normalize(si.sh_frame.n + d_across * (cos / dr.squared_norm(d_across)))  # at right angles to d
+        radius = dr.mulsign(dr.gather(mi.Float, self.radius, place - 1, at_outline), cos)  # normals may be flipped
+        n = mi.Normal3f(dr.sqrt(1 - GRAZING**2) * contact - dr.mulsign(GRAZING, cos) * d)
         si.n = dr.select(at_outline, dr.mulsign(mi.Float(1), dr.dot(si.n, n)) * n, si.n)
+        si.p = dr.select(at_outline, si.p + radius * (contact - si.sh_frame.n), si.p)
         si.sh_frame = dr.select(at_outline, mi.Frame3f(n), si.sh_frame)
         si.wi = dr.select(at_outline, si.to_local(-d), si.wi)
         return si
