@@ -31,9 +31,10 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
+from ..paths.edge_on import GRAZING, GRAZING_FLAT
 from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
-from ..paths.recording import GRAZING, PathRecords
+from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
 
@@ -79,13 +80,13 @@ class Flow(ABC):
 
 
 def material_segment(
-    x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool, rests: bool = False
+    x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool, rests: bool = False, flat=GRAZING
 ):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 
     `measure` = [G |dA|] / detach(G |dA|), G = |cosθ_y| / r² [Zhang et al. 2020, Eq. 6]; where `hit` escaped, or is x
     itself, the direction stays as it is. `rests`: the point and |dA| are known to rest, which spares the way back to
-    vertices.
+    vertices. `flat`: cosine below which triangles are taken to be seen edge-on.
     """
     ray = mi.Ray3f(dr.detach(x), hit.d, 0, wavelengths)
     with dr.suspend_grad(when=rests):
@@ -101,7 +102,7 @@ def material_segment(
     area = mi.Float(1) if rests else _area_element(si, on_surface)
     cos = dr.abs_dot(si.n, ω)
     # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
-    usable = on_surface & (cos > GRAZING) & (area > 0)
+    usable = on_surface & (cos > dr.select(si.shape.is_mesh(), flat, GRAZING)) & (area > 0)
     measure = dr.select(usable, cos / dist2 * area, 1)
     return si, ω, dr.relative_grad(measure)
 
@@ -113,7 +114,8 @@ def emission_towards(
 
     `rests`: `SceneTraits.lights_rest`.
     """
-    si, ω, measure = material_segment(x, hit, wavelengths, moves, active, rests)
+    # What a light sends goes by cosθ, which makes up for 1/cosθ.
+    si, ω, measure = material_segment(x, hit, wavelengths, moves, active, rests, GRAZING_FLAT)
     return si, ω, emitter.eval(si, active) * measure
 
 

@@ -25,6 +25,10 @@ from ..scene.registry import registry_values
 #: sphere the rounding of float32 makes any cosine below this one. Costs that share of what is smooth near an outline.
 GRAZING = 5e-4
 
+#: The same of lights of triangles, whose normals are as exact as directions; what they send goes by the cosine itself.
+#: A light had lost a tenth below the other limit of what it sends out of a gap a hundredth as wide as it is long.
+GRAZING_FLAT = 2e-6
+
 #: Shapes without triangles that are met edge-on at their outlines.
 ROUND = ("sphere", "cylinder")
 

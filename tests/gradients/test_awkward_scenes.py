@@ -251,3 +251,19 @@ def test_coverage_needs_no_light(llvm):
         assert (found[..., :3] == 0).all()
         assert found[..., 3].sum() == pytest.approx(expected, rel=0.02)
         assert np.abs(found[:, 7:9, 3]).sum() == pytest.approx(np.abs(found[..., 3]).sum())
+
+
+def test_light_out_of_a_narrow_gap(llvm):
+    """A lamp that faces the ceiling, h = 0.01 below it, lights a strip of the wall, by the height δ above it: what
+    is seen is I = ∫ s δ dδ = s h²/2, and lifting the lamp changes it by -s h = -2 I/h. A tenth of that is light that
+    leaves the lamp at a cosine below 5e-4.
+    """
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    view = {"type": "perspective", "fov": 0.35, "film": film,
+            "to_world": T().look_at(origin=[0, 1, 6.8], target=[0, 2.99, -2], up=[0, 1, 0])}  # fmt: skip
+    lamp = {"type": "rectangle", "to_world": T().translate([0, 2.99, 0]).rotate([1, 0, 0], -90).scale(0.5),
+            "emitter": {"type": "area"}}  # fmt: skip
+    room = scene(camera=view, lamp=lamp, wall={"type": "rectangle", "to_world": T().translate([0, 1, -2]).scale(2)})
+    seen = np.array(mi.render(room, spp=4096)).mean()
+    found = forward(perturb(room, "lamp.to_world", (0, 1, 0)), {"type": "psdr_path", "max_depth": 2}, SEEDS, 256)
+    assert found.mean() == pytest.approx(-2 * seen / 0.01, rel=0.02)
