@@ -134,7 +134,7 @@ class AnalyticShapes:
             return None
         shapes = tuple(job.scene.shapes()[s.index] for s in chosen)
         number = registry_values(job.scene, {s.index: i + 1 for i, s in enumerate(chosen)})
-        columns = Poses.of(shapes).at(dr.arange(mi.UInt32, len(shapes)))
+        columns = Poses.of(shapes).columns
         kind = mi.UInt32([list(CURVES_OF).index(s.plugin) for s in chosen])
         dr.eval(number, columns, kind)
         return AnalyticShapes(number, columns, kind)

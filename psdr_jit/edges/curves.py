@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -53,7 +54,10 @@ class CurveSet:
     shapes: tuple[mi.Shape, ...]
     pointers: mi.ShapePtr | None  # to `shapes`, for intersections
     rows: CurveRows | None
-    poses: Poses | None = None  # of `shapes`
+
+    @cached_property
+    def poses(self) -> Poses:
+        return Poses.of(self.shapes)
 
 
 @dataclass
@@ -75,7 +79,7 @@ def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
     rows = CurveRows(kind, owner, uploaded(mi.Float, np.tile(np.arange(PIECES) / PIECES, len(curves))))
     owners = tuple(shape for shape, _ in shapes)
     pointers = mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0])
-    return CurveSet(owners, pointers, rows, Poses.of(owners))
+    return CurveSet(owners, pointers, rows)
 
 
 def transform_point(columns: tuple[mi.Vector3f, ...], x: mi.Point3f) -> mi.Point3f:

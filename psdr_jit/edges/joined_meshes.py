@@ -7,7 +7,7 @@ would make a kernel for every shape.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,8 +17,7 @@ from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_bu
 from ..core.joining import joined
 from ..core.upload import uploaded
 from ..core.varying import varying
-from .geometry import EdgeTopologyDevice, upload_topology
-from .topology import INVALID, EdgeTopology
+from .geometry import EdgeTopologyDevice
 
 
 @dataclass
@@ -27,7 +26,9 @@ class JoinedTopology:
 
     device: EdgeTopologyDevice  # vertices and faces numbered through
     shape: mi.UInt32  # by edge: index of its mesh
-    first_face: mi.UInt32  # by mesh
+    prim0: mi.UInt32  # by edge: its faces, by the mesh's own numbers
+    prim1: mi.UInt32
+    shell: mi.Float  # by edge, see `EdgeRows`
 
 
 def attached_positions(meshes: Sequence[mi.Mesh]) -> mi.Point3f:
@@ -55,24 +56,26 @@ def by_face(meshes: Sequence[mi.Mesh]) -> tuple[mi.UInt32, mi.UInt32]:
     return uploaded(mi.UInt32, shape), uploaded(mi.UInt32, number)
 
 
-def joined_topology(meshes: Sequence[mi.Mesh], topologies: Sequence[EdgeTopology]) -> JoinedTopology:
-    """The edges of all meshes; `topologies` of each."""
-    faces = _first([mesh.face_count() for mesh in meshes])
-    edges = [len(topology) for topology in topologies]
-    vertex, face = (
-        np.repeat(start, edges).astype(np.uint32) for start in (_first([mesh.vertex_count() for mesh in meshes]), faces)
-    )
-    together = {name: np.concatenate([getattr(t, name) for t in topologies])
-                for name in ("v0", "v1", "w0", "w1", "f0", "f1", "corner0", "corner1", "split")}  # fmt: skip
-    for name in ("v0", "v1", "w0", "w1"):
-        together[name] = together[name] + vertex
-    border = together["f1"] == INVALID
-    together["f0"] = together["f0"] + face
-    together["f1"] = np.where(border, INVALID, together["f1"] + face)
-    counts = dict(nonmanifold_edges=0, degenerate_faces=0, sliver_faces=0, sliver_share=0.0, duplicate_faces=0)
-    found = EdgeTopology(**together, **counts)  # what is said of them has been said of each
+def joined_topology(
+    meshes: Sequence[mi.Mesh], devices: Sequence[EdgeTopologyDevice], shells: Sequence[mi.Float]
+) -> JoinedTopology:
+    """The edges of all meshes; `devices` and `shells` of each."""
+    edges = [dr.width(device.v0) for device in devices]
+    vertex, face = (uploaded(mi.UInt32, np.repeat(_first([count(mesh) for mesh in meshes]), edges))
+                    for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))  # fmt: skip
+
+    def column(name: str):
+        parts = [getattr(device, name) for device in devices]
+        if dr.depth_v(parts[0]) == 1:
+            return joined(parts)
+        return type(parts[0])(*(joined([part[axis] for part in parts]) for axis in range(len(parts[0]))))
+
+    own = EdgeTopologyDevice(**{name: column(name) for name in EdgeTopologyDevice.__dataclass_fields__})
+    together = replace(own, v0=own.v0 + vertex, v1=own.v1 + vertex, f0=own.f0 + face, f1=own.f1 + face)
     shape = uploaded(mi.UInt32, np.repeat(np.arange(len(edges)), edges))
-    return JoinedTopology(upload_topology(found), shape, uploaded(mi.UInt32, faces))
+    found = JoinedTopology(together, shape, own.f0, own.f1, joined(shells))
+    dr.eval(found)
+    return found
 
 
 def _first(counts: Sequence[int]) -> np.ndarray:

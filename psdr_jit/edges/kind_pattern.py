@@ -15,6 +15,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import ClassVar
 
 import drjit as dr
@@ -243,18 +244,22 @@ class AnalyticPatterns(PatternLines):
 
     closed: mi.Bool  # by row: a sphere whose inside is never seen
 
+    @cached_property
+    def poses(self) -> Poses:
+        return Poses.of(self.shapes)
+
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        columns = Poses.of(self.shapes).at(rows.shape)
+        columns = self.poses.at(rows.shape)
         x, du, dv = surface_point(rows.part, q)
         return SurfacePoint(transform_point(columns, x), *(transform_vector(columns, d) for d in (du, dv)))
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        return transform_point(Poses.of(self.shapes).attached_at(rows.shape), surface_point(rows.part, q)[0])
+        return transform_point(self.poses.attached_at(rows.shape), surface_point(rows.part, q)[0])
 
     def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         """The far side of a sphere of which the inside is never seen."""
         rows, eye = self.lines.rows, viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        centre = mi.Point3f(Poses.of(self.shapes).at(rows.shape)[3])
+        centre = mi.Point3f(self.poses.at(rows.shape)[3])
         away = mi.Bool(self.closed)
         for x in corners:
             n, view = dr.normalize(x - centre), towards_viewer(eye, x)

@@ -14,10 +14,12 @@ the sheet does not matter. ḋ is 0 but where the opening of a spot is different
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.joining import joined
 from ..core.varying import varying
 from ..scene.poses import Poses
 from .curves import transform_point, transform_vector
@@ -86,6 +88,10 @@ class LightSteps:
     reshaped: bool  # the opening of a spot is differentiated
     far: float  # distance at which lights are asked about themselves [m]: the size of the scene
 
+    @cached_property
+    def poses(self) -> Poses:
+        return Poses.of(self.lights)
+
     def moves(self, at: EdgeLocation) -> mi.Bool:
         return dr.gather(mi.UInt32, self.moving, dr.gather(mi.UInt32, self.rows.light, at.row)) != 0
 
@@ -94,7 +100,7 @@ class LightSteps:
         rows = dr.gather(LightStepRows, self.rows, at.row)
         films = films_of(self.lights, self.far) if self.reshaped else self.films
         d, _, _ = _direction(rows, at.t, dr.gather(LightFilm, films, rows.light))
-        x = transform_point(Poses.of(self.lights).attached_at(rows.light), mi.Point3f(at.scale * d))
+        x = transform_point(self.poses.attached_at(rows.light), mi.Point3f(at.scale * d))
         return mi.Vector3f(x - dr.detach(x))
 
     def ray(self, row: mi.UInt32, t: mi.Float) -> LightRay:
@@ -102,7 +108,7 @@ class LightSteps:
         rows = dr.gather(LightStepRows, self.rows, row)
         films = dr.gather(LightFilm, self.films, rows.light)
         local = _direction(rows, t, films)
-        columns = Poses.of(self.lights).at(rows.light)
+        columns = self.poses.at(rows.light)
         w, dw, aside = (transform_vector(columns, v) for v in local)
         length = dr.norm(w)
         d = w / length
@@ -135,9 +141,9 @@ def films_of(lights: tuple[mi.Emitter, ...], far: float) -> LightFilm:
     """By light; attached to what opens the cones of spots. `far`: see `LightSteps`."""
     found = [_film(light, far) for light in lights]
     return LightFilm(
-        mi.Point2f(*(dr.concat([mi.Float(film.centre[axis]) for film in found]) for axis in range(2))),
-        mi.Vector2f(*(dr.concat([mi.Float(film.size[axis]) for film in found]) for axis in range(2))),
-        dr.concat([film.rim for film in found]),
+        mi.Point2f(*(joined([mi.Float(film.centre[axis]) for film in found]) for axis in range(2))),
+        mi.Vector2f(*(joined([mi.Float(film.size[axis]) for film in found]) for axis in range(2))),
+        joined([film.rim for film in found]),
     )
 
 

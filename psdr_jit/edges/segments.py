@@ -55,8 +55,8 @@ class MeshTopology:
 #: By mesh and its numbers of vertices and faces.
 TOPOLOGIES: Slot[dict[tuple[str | int, int, int], MeshTopology]] = Slot(dict)
 
-#: The topologies of the last edge set, identified by their addresses, and joined.
-TOGETHER: Slot[tuple[list[int], list[MeshTopology], JoinedTopology] | None] = Slot(lambda: None)
+#: The topologies of the last edge set, and joined.
+TOGETHER: Slot[tuple[list[MeshTopology], JoinedTopology] | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -198,10 +198,9 @@ def _rows(
     positions, faces, topo = dr.detach(attached_positions(meshes)), joined_faces(meshes), together.device
     dr.eval(positions, faces, jumps)
     g = edge_geometry(positions, faces, topo)
-    shape, shell = together.shape, joined([topology.shell for topology in topologies])
+    shape, shell = together.shape, together.shell
     smooth, moves = (dr.gather(mi.Bool, uploaded(mi.Bool, np.array(flags)), shape)
                      for flags in ([is_smooth(mesh) for mesh in meshes], moving))  # fmt: skip
-    first_face = dr.gather(mi.UInt32, together.first_face, shape)
     return EdgeRows(
         v0=mi.UInt32(topo.v0),
         v1=mi.UInt32(topo.v1),
@@ -219,13 +218,13 @@ def _rows(
         pattern=jumps,
         traced=dr.full(mi.Bool, False, dr.width(topo.v0)),
         moves=moves,
-        shell0=shell,
+        shell0=mi.Float(shell),
         shell1=mi.Float(shell),
         shape0=mi.UInt32(shape),
         shape1=mi.UInt32(shape),
-        prim0=topo.f0 - first_face,
-        prim1=topo.f1 - first_face,
-        corner0=topo.corner0,
+        prim0=mi.UInt32(together.prim0),
+        prim1=mi.UInt32(together.prim1),
+        corner0=mi.Vector2u(topo.corner0),
         corner1=mi.Vector2u(topo.corner1),
     )
 
@@ -233,8 +232,7 @@ def _rows(
 def _together(meshes: list[mi.Mesh], topologies: list[MeshTopology], memory: Memory) -> JoinedTopology:
     """The topologies as one, kept while each of them is."""
     known = memory[TOGETHER]
-    if known is None or known[0] != [id(topology) for topology in topologies]:
-        found = joined_topology(meshes, [topology.host for topology in topologies])
-        known = ([id(topology) for topology in topologies], topologies, found)
-        memory[TOGETHER] = known
-    return known[2]
+    if known is None or [id(topology) for topology in known[0]] != [id(topology) for topology in topologies]:
+        found = joined_topology(meshes, *zip(*((t.device, t.shell) for t in topologies), strict=True))
+        known = memory[TOGETHER] = (topologies, found)
+    return known[1]

@@ -80,7 +80,13 @@ class Flow(ABC):
 
 
 def material_segment(
-    x: mi.Point3f, hit: Hit, wavelengths, moves: Displacements, active: mi.Bool, rests: bool = False, flat=GRAZING
+    x: mi.Point3f,
+    hit: Hit,
+    wavelengths,
+    moves: Displacements,
+    active: mi.Bool,
+    rests: bool = False,
+    flat: float = GRAZING,
 ):
     """From the attached point `x` to the material point `hit`: `(si, ω, measure)`, all attached.
 

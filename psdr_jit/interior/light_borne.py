@@ -35,10 +35,10 @@ from ..core.varying import varying
 from ..errors import UnsupportedError
 from ..paths.bounce import PathLimits, particle_eval
 from ..paths.delta_step import delta_step
+from ..paths.edge_on import GRAZING
 from ..paths.light_source import LightStart
 from ..paths.light_walk import LightPath
 from ..paths.rays import interaction
-from ..paths.recording import GRAZING
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from .flow import material_segment

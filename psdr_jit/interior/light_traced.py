@@ -32,12 +32,13 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.bounce import PathLimits
 from ..paths.delta_step import delta_step
+from ..paths.edge_on import GRAZING
 from ..paths.light_source import LightStart
 from ..paths.light_technique import average
 from ..paths.light_vertices import LightVertices
 from ..paths.light_walk import LightPath, trace_light
 from ..paths.rays import interaction, shadow_hit
-from ..paths.recording import GRAZING, PathRecords
+from ..paths.recording import PathRecords
 from ..plan.job import Job
 from . import light_borne
 from .flow import Flow

@@ -52,7 +52,7 @@ class EdgeOn:
             return None
         place = registry_values(scene, {s.index: i + 1 for i, s in enumerate(chosen)})
         shapes = scene.shapes()
-        x_axis, _, z_axis, _ = Poses.of([shapes[s.index] for s in chosen]).at(dr.arange(mi.UInt32, len(chosen)))
+        x_axis, _, z_axis, _ = Poses.of([shapes[s.index] for s in chosen]).columns
         long = uploaded(mi.Float, np.array([s.plugin == "cylinder" for s in chosen]))
         found = EdgeOn(place, dr.norm(x_axis), long * dr.normalize(z_axis))
         dr.eval(found.place, found.radius, found.axis)

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.cones import Cones
+from ..core.joining import joined
 from ..core.memory import Slot
 from ..core.varying import varying
 from ..edges.kind import Use, Views
@@ -113,8 +114,7 @@ def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
         return None
     flags = mi.Bool(True)
     if movers is not None:
-        joined = [dr.select(moving, mi.UInt32(0), 1) for moving in table.moving()]
-        flags = (joined[0] if len(joined) == 1 else dr.concat(joined)) != 0
+        flags = ~joined(table.moving())
     return SecondaryEdges(table, rows, state, use, movers, flags)
 
 

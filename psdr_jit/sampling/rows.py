@@ -14,9 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import drjit as dr
 import mitsuba as mi
 
+from ..core.joining import joined
 from ..core.memory import Slot
 from ..core.varying import varying
 from ..edges.location import EdgeLocation
@@ -53,7 +53,7 @@ class WeightedRows(RowSampler):
     def init(self, what: str, weights: list[mi.Float]) -> EdgeDistribution | None:
         if not weights:
             return None
-        distribution = edge_distribution(weights[0] if len(weights) == 1 else dr.concat(weights))
+        distribution = edge_distribution(joined(weights))
         return distribution if float(distribution.total[0]) > 0 else None
 
     def sample(self, state: EdgeDistribution, u: mi.Float64) -> tuple[mi.UInt32, mi.Float]:

@@ -21,6 +21,7 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 UNUSED = re.compile(r"Found unused parameters: - \$([\w.-]+)=")  # how Mitsuba says that a file has no such <default>
 DEFAULT = re.compile(r'<default\s+name\s*=\s*"([^"]+)"')
 
+LISTED = 5  # mesh files in an error, at most
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -43,10 +44,6 @@ def use_variant(name: str) -> None:
             raise   # a module of ours is missing: a defect, not a matter of set-up
         raise SetupError(f"variant '{name}' does not start: {error}. "
                          "'psdr doctor' says what is missing") from error
-
-
-#: Mesh files that an error lists, at most.
-LISTED = 5
 
 
 def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:

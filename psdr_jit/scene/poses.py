@@ -16,20 +16,19 @@ class Poses:
     """Object-to-world maps (x, y, z axis, origin) of several shapes or lights, read once."""
 
     matrices: tuple[mi.Matrix4f, ...]  # attached to the shapes' `to_world`
-    entries: tuple[tuple[mi.Float, ...], ...]  # by column and row, one value for each shape; detached
+    columns: tuple[mi.Vector3f, ...]  # one entry for each shape; detached
 
     @staticmethod
     def of(shapes: Sequence[mi.Object]) -> Poses:
         matrices = tuple(mi.traverse(shape)["to_world"].matrix for shape in shapes)
-        entries = tuple(
-            tuple(joined([dr.detach(mi.Float(m[i, j])) for m in matrices]) for i in range(3)) for j in range(4)
-        )
-        dr.eval(entries)
-        return Poses(matrices, entries)
+        columns = tuple(mi.Vector3f(*(joined([dr.detach(mi.Float(m[i, j])) for m in matrices]) for i in range(3)))
+                        for j in range(4))  # fmt: skip
+        dr.eval(columns)
+        return Poses(matrices, columns)
 
     def at(self, index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
         """Of each lane's shape, detached."""
-        return tuple(mi.Vector3f(*(dr.gather(mi.Float, entry, index) for entry in column)) for column in self.entries)
+        return tuple(dr.gather(mi.Vector3f, column, index) for column in self.columns)
 
     def attached_at(self, index: mi.UInt32) -> tuple[mi.Vector3f, ...]:
         """Of each lane's shape, attached."""
@@ -38,7 +37,7 @@ class Poses:
             return self.at(index)
 
         def entry(i: int, j: int) -> mi.Float:
-            values = mi.Float(self.entries[j][i])
+            values = mi.Float(self.columns[j][i])
             for k in moving:
                 dr.scatter(values, mi.Float(self.matrices[k][i, j]), mi.UInt32(k))
             return dr.gather(mi.Float, values, index)
@@ -52,8 +51,7 @@ def spheres_of(scene: mi.Scene, indices: Sequence[int]) -> tuple[mi.Point3f, mi.
     Stored, one entry for each, detached. Scales are uniform: Mitsuba's spheres have no others.
     """
     shapes = scene.shapes()
-    found = tuple(shapes[index] for index in indices)
-    x_axis, _, _, centre = Poses.of(found).at(dr.arange(mi.UInt32, len(found)))
+    x_axis, _, _, centre = Poses.of([shapes[index] for index in indices]).columns
     centres, radii = mi.Point3f(centre), dr.norm(x_axis)
     dr.make_opaque(centres, radii)
     return centres, radii

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.compat import CONTROL_POINTS
 from ..core.ellipsoid import Ellipsoid
+from ..core.joining import joined
 from ..core.memory import Memory
 from ..core.rod import Rod
 from ..core.tube_axis import Axis
@@ -185,7 +186,7 @@ def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | No
         owner.append(np.full(len(own), k))
         start[ids[facts_of.index]], count[ids[facts_of.index]] = segments, len(own)
         segments += len(own)
-    flat = points[0] if len(points) == 1 else dr.concat(points)
+    flat = joined(points)
     dr.eval(flat)
     tables = [uploaded(mi.UInt32, np.concatenate(a)) for a in (first, owner)]
     moves = tuple(s.moves for s in chosen)
