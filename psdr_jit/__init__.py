@@ -22,8 +22,10 @@ __version__ = "0.1.0"
 
 from .setup.drjit_libraries import mitsuba_can_load as _mitsuba_can_load
 from .setup.llvm import apply_saved_choice as _apply_saved_choice
+from .setup.quick_compile import apply_if_asked as _compile_quickly_if_asked
 
 _apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
+_compile_quickly_if_asked()
 
 if _mitsuba_can_load():  # otherwise `psdr doctor` must be able to say what is wrong
     from . import plugins as plugins  # registers the integrators, now and after every variant switch

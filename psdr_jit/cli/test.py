@@ -2,7 +2,8 @@
 
 Everything after `test` goes to pytest as it is; without arguments the whole suite runs, but not the tests marked slow
 (finite-difference references that take minutes). The tests are in a clone only, and pytest runs in its root, in as many
-processes as there are cores (`-n 0`: in one, as with `-s` or `--pdb`).
+processes as there are cores (`-n 0`: in one, as with `-s` or `--pdb`). Kernels are compiled quickly, see the README
+(PSDR_QUICK_COMPILE=0: as they are for users).
 
     ./psdr test                             all but the slow ones
     ./psdr test -m slow                     the slow ones
@@ -24,7 +25,7 @@ from pathlib import Path
 
 import psdr_jit
 from psdr_jit.errors import SetupError
-from psdr_jit.setup import drjit_libraries, llvm
+from psdr_jit.setup import drjit_libraries, llvm, quick_compile
 
 NAME = "test"
 HELP = "run the test suite (needs a clone)"
@@ -53,6 +54,11 @@ def environment() -> dict[str, str]:
     return {key: value for key, value in os.environ.items() if key != drjit_libraries.NO_PLUGINS}
 
 
+def environment_of_tests() -> dict[str, str]:
+    """Kernels of tests run once or twice: to compile them is most of the time that the suite takes."""
+    return quick_compile.of_child(environment())
+
+
 def run(args: argparse.Namespace) -> int:
     """pytest's verdict as one of ours; a crash or an error while collecting is a failed check."""
     root = checkout("tests", NAME)
@@ -61,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     llvm.ensure_llvm()
     given = [absolute(word, root) for word in args.rest]
     command = [sys.executable, "-m", "pytest", *processes(given), *given]
-    status = subprocess.run(command, cwd=root, env=environment(), check=False).returncode
+    status = subprocess.run(command, cwd=root, env=environment_of_tests(), check=False).returncode
     return EXIT_STATUS.get(status, 1)
 
 
