@@ -14,8 +14,8 @@ infinitely distant emitters have r_B/r_S = 0, and a directional light that turns
 replace L_e dω by their intensity over distance².
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
 brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`), and so
-do the planes of coarse smooth-shaded faces (`horizons.py`). Lights that touch what they shine on are left to the
-indirect term (`edges/followed_lights.py`).
+do the planes of coarse smooth-shaded faces, whether they are lit or shine (`horizons.py`, `light_horizons.py`). Lights
+that touch what they shine on are left to the indirect term (`edges/followed_lights.py`).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from ..plan.reasons import NOTHING_SCATTERS, steps_rest
 from ..plan.term import EdgeSampling, Term, Verdict
 from ..sampling.guided import guided
 from ..sampling.horizons import horizon_weights
+from ..sampling.light_horizons import light_horizon_weights
 from ..sampling.light_steps import light_step_weights
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
@@ -51,6 +52,7 @@ from ..scene.facts import SceneFacts
 from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
+from .light_horizons import LIGHT_HORIZONS
 from .light_lines import LightLine, sample_light_lines
 from .light_steps import BORNE
 from .light_steps import ESTIMATOR as LIGHT_STEPS
@@ -222,6 +224,8 @@ SHADOWS = SecondaryTerm(
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
     others = [SHADOWS]
+    if any(shape.smooth and shape.is_emitter for shape in job.facts.shapes):
+        others.insert(0, LIGHT_HORIZONS)
     if job.facts.has_light_steps:
         others.insert(0, LIGHT_STEPS)
         if job.light is not None and job.facts.has_delta_lobes:
@@ -274,13 +278,20 @@ TERM = Term(
         Stream.LIGHT_STEP_SUBPATH,
         Stream.HORIZON,
         Stream.HORIZON_SUBPATH,
+        Stream.LIGHT_HORIZON,
+        Stream.LIGHT_HORIZON_SUBPATH,
     ),
     needed=needed,
     cost=cost,
     forward=forward,
     backward=backward,
     edges=EdgeSampling(
-        lambda job: line_weights(job, Use.SHADOW) + light_step_weights(job) + horizon_weights(job, NAME, direct=True),
+        lambda job: (
+            line_weights(job, Use.SHADOW)
+            + light_step_weights(job)
+            + horizon_weights(job, NAME, direct=True)
+            + light_horizon_weights(job)
+        ),
         "no light sees the others as an outline, or they are coplanar",
     ),
     guided=3,

@@ -84,15 +84,17 @@ def shared_out(job: Job, horizons: SecondaryTerm, others: list[SecondaryTerm]) -
 
 def sample_lights(job: Job, horizons: SampledHorizons) -> HorizonLine:
     """Towards lights."""
-    return _sample(job, horizons, edge_samples(job, paths=1), Stream.HORIZON)
+    return sample_lines(job, horizons, 1, Stream.HORIZON)
 
 
 def sample_views(job: Job, horizons: SampledHorizons) -> HorizonLine:
     """For the indirect term, of which a sample takes two paths."""
-    return _sample(job, horizons, edge_samples(job, paths=2), Stream.HORIZON_VIEW)
+    return sample_lines(job, horizons, 2, Stream.HORIZON_VIEW)
 
 
-def _sample(job: Job, horizons: SampledHorizons, count: int, stream: Stream) -> HorizonLine:
+def sample_lines(job: Job, horizons: SampledHorizons, paths: int, stream: Stream) -> HorizonLine:
+    """As many as a term has samples that take `paths` paths each."""
+    count = edge_samples(job, paths=paths)
     lane = dr.arange(mi.UInt32, count)
     rng = lane_sampler(stream_seed(job.seed, stream), lane)
     row, t, pdf_row = horizons.sample_rows(count, rng.next_1d())
@@ -101,9 +103,12 @@ def _sample(job: Job, horizons: SampledHorizons, count: int, stream: Stream) -> 
     return HorizonLine(lane, row, t, on, on.pdf * pdf_row, wavelengths, weight)
 
 
-def receiver(on: HorizonPoint) -> tuple[Hit, mi.Float]:
-    """x_D as the end of a ray that meets it at a small angle, and the cosine of that angle."""
-    ω = dr.normalize(on.ω + TILT * on.n)
+def receiver(on: HorizonPoint, towards: mi.Float | float = 1.0) -> tuple[Hit, mi.Float]:
+    """The point of the face as the end of a ray that meets it at a small angle, and the cosine of that angle.
+
+    `towards`: 1 from above the face, -1 from below.
+    """
+    ω = dr.normalize(on.ω + TILT * towards * on.n)
     pi = mi.PreliminaryIntersection3f(on.pi)
     return Hit.of(mi.Ray3f(on.x + on.size * ω, -ω), pi), dr.abs(dr.dot(on.n, ω))
 

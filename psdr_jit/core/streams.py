@@ -37,6 +37,8 @@ class Stream(IntEnum):
     LIGHT_CHAIN_PILOT = 21
     SPHERE_RIMS = 22
     SPHERE_RIM_PATHS = 23
+    LIGHT_HORIZON = 24
+    LIGHT_HORIZON_SUBPATH = 25
 
 
 def other_seed(seed: int | mi.UInt32, key: int) -> mi.UInt32:

@@ -21,21 +21,8 @@ BENT, BENT_SHARE = 5.0, 0.02
 #: through which the plane of every face passes.
 COARSE, COARSE_UNDER_SKY = 35.0, 20.0
 
-#: The same for lights, by whose normals Mitsuba samples them.
-COARSE_LIGHT = 20.0
-
-#: What is wrong with coarse surfaces that reflect, and with coarse lights.
-STEPS_OF_FACES = (
-    "where the plane of a face passes through a light or through what is lit, a step of what it reflects is missing "
-    "from the derivative, and so is what gets in and out between its faces"
-)
-WEIGHTS_OF_LIGHTS = (
-    "Mitsuba samples its light as if its faces had these normals, and how that changes is missing from the derivative: "
-    "a few %, and nearly all if it turns in place"
-)
-
-#: Of an integrator: by name of a mesh, its arrays when it was looked at, and whether it is bent.
-BENT_MESHES: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
+#: Of an integrator: by name of a mesh and limit, its arrays when it was looked at, and whether it is bent that far.
+BENT_MESHES: Slot[dict[tuple[str | int, float], tuple[list, bool]]] = Slot(dict)
 
 #: Of an integrator: the meshes that have been looked at for a warning, by name, and with which limit.
 LOOKED_AT: Slot[set[tuple[str | int, float]]] = Slot(set)
@@ -43,28 +30,25 @@ LOOKED_AT: Slot[set[tuple[str | int, float]]] = Slot(set)
 
 def bent_meshes(meshes: list[mi.Mesh], memory: Memory) -> list[bool]:
     """By mesh: are its normals so far off its faces that their horizons matter? Remembered while it rests."""
-    return [_is_bent(mesh, memory) for mesh in meshes]
+    return [bends(mesh, BENT, memory) for mesh in meshes]
 
 
-def _is_bent(mesh: mi.Mesh, memory: Memory) -> bool:
+def bends(mesh: mi.Mesh, limit: float, memory: Memory) -> bool:
+    """Are normals more than `limit` degrees off their faces, over `BENT_SHARE`? Remembered while the mesh rests."""
     with dr.suspend_grad():
         kept, buffers = memory[BENT_MESHES], list(mesh_buffers(mesh))
-        return while_unchanged(kept, key_of(mesh), buffers, lambda: _bent_share(mesh, BENT) > BENT_SHARE)
+        return while_unchanged(kept, (key_of(mesh), limit), buffers, lambda: _bent_share(mesh, limit) > BENT_SHARE)
 
 
-def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory, so: str = STEPS_OF_FACES) -> None:
-    """Name meshes whose shading normals are more than `limit` degrees off their faces, once each; `so`: what follows.
+def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory) -> None:
+    """Name meshes whose shading normals are more than `limit` degrees off their faces, once each.
 
-    For meshes that shine or let light through: of what they send, as much as sinks below the plane of one of their
+    For meshes that let light through: of what they send, as much as sinks below the plane of one of their
     faces is lost in a step, which neither an edge nor a horizon stands for. And for two-sided ones: what sinks below a
     face gets inside, and out again, by way of edges that are only there for who is inside. That takes large angles,
     under a sky as well: with more than half of a body of 948 faces bent by 20 degrees, and 29 % by 35, the gain is
     0.98 +- 0.03. Mirrors, whose steps are edges, are right at 30 degrees (1.01 +- 0.01 over a floor under a sky), and
     a few % off at 55.
-
-    Lights, moreover, are sampled with densities per solid angle that have the cosines of their interpolated normals:
-    a ball of 8, 12, 16 segments is 2.0, 1.2, 0.2 % too bright. Moved, gains are 1.025, 1.0005 and 1.0002 +- 0.005;
-    turned in place, when the true derivative is small, 0.05, 0.2 and 0.4 +- 0.3.
     """
     for mesh in [mesh for mesh in meshes if (key_of(mesh), limit) not in memory[LOOKED_AT]]:
         memory[LOOKED_AT].add((key_of(mesh), limit))
@@ -73,7 +57,8 @@ def warn_about_coarse(meshes: list[mi.Mesh], limit: float, memory: Memory, so: s
         if share > BENT_SHARE:
             warn_once(
                 f"mesh '{shown_name(mesh)}' is shaded with normals that are more than {limit:g} degrees off its "
-                f"faces: {so}; "
+                "faces: where the plane of a face passes through a light or through what is lit, a step of what it "
+                "reflects is missing from the derivative, and so is what gets in and out between its faces; "
                 "split its normals at sharp edges, set face_normals, or use a finer mesh",
                 UnsupportedWarning,
                 memory,

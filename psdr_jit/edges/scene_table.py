@@ -24,7 +24,7 @@ from ..scene.facts import ShapeFacts
 from ..scene.grids import VALUES, blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
-from .coarse import COARSE, COARSE_LIGHT, COARSE_UNDER_SKY, WEIGHTS_OF_LIGHTS, warn_about_coarse
+from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
 from .contact_limits import touching, warn_about_contacts
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
@@ -214,8 +214,6 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.
         flips = job.facts.has_delta_emitters and job.options.depth_limit > 2
         smooth = [(shape, s) for shape, s in zip(shapes, meshes, strict=True) if s.smooth]
-        lights = [shape for shape, s in smooth if s.is_emitter]
-        warn_about_coarse(lights, COARSE_LIGHT, job.call.memory, WEIGHTS_OF_LIGHTS)
         sends = [shape for shape, s in smooth if not s.is_emitter and (lets_through(shape) or flips)]
         warn_about_coarse(sends, limit, job.call.memory)
         others = [shape for shape, s in smooth if s.delta_lobes or _lets_light_in(job, shape)]

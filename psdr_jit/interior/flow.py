@@ -35,6 +35,7 @@ from ..paths.edge_on import GRAZING, GRAZING_FLAT
 from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
 from ..paths.recording import PathRecords
+from ..paths.smooth_lights import SmoothLights
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
 
@@ -55,7 +56,7 @@ class SceneTraits:
 
     delta_emitters: bool
     delta_lobes: bool  # where geometry moves, only the spatial flow follows them
-    smooth_lights: bool  # smooth-shaded area lights, see `next_event`
+    smooth_lights: SmoothLights | None  # if there are any
     tubes: Tubes | None = None  # curves
     followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
     lights_rest: bool = False  # area lights stay where they are, and as large
@@ -142,11 +143,7 @@ def _area_element(si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
 def next_event(
     si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, nee: EmitterSample, traits: SceneTraits, moves: Displacements
 ) -> mi.Spectrum:
-    """Scattered emitter sample, attached: f(ω) · value · MIS / pdf.
-
-    Mitsuba weighs samples of a smooth-shaded light as if its faces were turned as its shading normals n_s are. What
-    they are expected to bring then varies with n_s·ω in place of n_g·ω, and ends continuously at its shading outline.
-    """
+    """Scattered emitter sample, attached: f(ω) · value · MIS / pdf."""
     active = nee.emitter != 0
     emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
     hit, resting = nee.hit(dr.detach(si.p)), active
@@ -154,10 +151,8 @@ def next_event(
         along = active & traits.followed.has(emitter, active)
         resting = active & ~along
     light, ω, value = emission_towards(si.p, hit, si.wavelengths, emitter, moves, resting, traits.lights_rest)
-    if traits.smooth_lights:
-        n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
-        usable = resting & light.is_valid() & (n_g > GRAZING) & (n_s > GRAZING)
-        value *= dr.relative_grad(dr.select(usable, n_s / n_g, 1))
+    if traits.smooth_lights is not None:
+        value *= traits.smooth_lights.of_sample(si, bsdf, light, ω, nee.mis, resting)
     if traits.delta_emitters:
         is_delta = active & nee.delta
         seen = mi.SurfaceInteraction3f(si)

@@ -43,7 +43,10 @@ class MaterialFlow(Flow):
         f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), goes_on)
         w = f * measure * vertex.onward.inv_pdf()
         emitter, emits = emitter_behind(self.scene, following, behind, goes_on)
-        L += dr.select(emits, w * emitter.eval(behind, emits) * following.weight_emission, 0)
+        value = emitter.eval(behind, emits)
+        if self.traits.smooth_lights is not None:
+            value *= self.traits.smooth_lights.of_ray(si, bsdf, behind, ω, following.weight_emission, emits)
+        L += dr.select(emits, w * value * following.weight_emission, 0)
         return VertexTerms(si.p, following.hit.d, L, w)
 
 

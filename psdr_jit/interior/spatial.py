@@ -54,8 +54,11 @@ class SpatialFlow(Flow):
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
         along = mi.Bool(False) if self.traits.followed is None else self.traits.followed.has(emitter, emits)
-        _, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along,
-                                       self.traits.lights_rest)  # fmt: skip
+        light, ω, value = emission_towards(si.p, following.hit, si.wavelengths, emitter, moves, emits & ~along,
+                                           self.traits.lights_rest)  # fmt: skip
+        if self.traits.smooth_lights is not None:
+            weighed = emits & ~along & ~vertex.onward.delta
+            value *= self.traits.smooth_lights.of_ray(si, bsdf, light, ω, following.weight_emission, weighed)
         w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
         if self.traits.delta_lobes:
             is_delta = vertex.onward.delta

@@ -49,7 +49,7 @@ def horizons(job: Job, term: str, direct: bool) -> Horizons | None:
     known = job.shared[TABLES].setdefault(term, [])
     if not known:
         faces = _faces(job)
-        targets = None if faces is None else (_lights(job) if direct else _all_around())
+        targets = None if faces is None else (_lights(job) if direct else all_around())
         known.append(None if targets is None else Horizons(faces, targets))
     return known[0]
 
@@ -63,28 +63,31 @@ def horizon_weights(job: Job, term: str, direct: bool) -> list[mi.Float]:
     rows, face = table.face(row)
     n = dr.normalize(face.n_g)
     n_s = dr.normalize(face.n[0] + face.n[1] + face.n[2])
-    middle, spread = face.at(mi.Point2f(1 / 3)), _spread(face)
-    weight = face.area * spread * _seen(job, rows.shell, n, middle)
+    middle, slant = face.at(mi.Point2f(1 / 3)), spread(face)
+    weight = face.area * slant * _seen(job, rows.shell, n, middle)
     to = table.target(row)
     d = to.centre - middle
     far = dr.norm(d)
-    lit = dr.minimum(dr.maximum(dr.dot(n_s, d) / far, 0) + LEAST * spread, spread)
+    lit = dr.minimum(dr.maximum(dr.dot(n_s, d) / far, 0) + LEAST * slant, slant)
     straddled = dr.abs(dr.dot(n, d)) < to.radius + dr.maximum(far, face.size) * 1e-6
     angle = dr.pi * dr.minimum(to.radius / far, 1)
     near = dr.maximum(far, to.radius)
-    at_ball = dr.select(straddled, lit / dr.maximum(spread, 1e-6) * angle / near, 0)
+    at_ball = dr.select(straddled, lit / dr.maximum(slant, 1e-6) * angle / near, 0)
     weight *= dr.select(to.radius > 0, at_ball, 1)
     relevant = mi.Bool(True) if _sources_move(job, direct) else rows.moves
-    chosen = dr.gather(mi.UInt32, _flags(_parted(job, table.faces)), rows.shape) != 0
+    chosen = dr.gather(mi.UInt32, flags(_parted(job, table.faces)), rows.shape) != 0
     return [dr.select(relevant & chosen & dr.isfinite(weight), weight, 0)]
+
+
+def smooth_faces(job: Job) -> SmoothFaces | None:
+    """The faces of smooth-shaded meshes, if there are any."""
+    return next((kind.faces for kind in scene_edges(job).kinds if isinstance(kind, ShadingOutlines)), None)
 
 
 def _faces(job: Job) -> SmoothFaces | None:
     """The faces of smooth-shaded meshes, if one of these is coarse."""
-    kinds = [kind for kind in scene_edges(job).kinds if isinstance(kind, ShadingOutlines)]
-    if not kinds or not any(_parted(job, kinds[0].faces)):
-        return None
-    return kinds[0].faces
+    faces = smooth_faces(job)
+    return None if faces is None or not any(_parted(job, faces)) else faces
 
 
 def _parted(job: Job, faces: SmoothFaces) -> list[bool]:
@@ -96,7 +99,8 @@ def _parted(job: Job, faces: SmoothFaces) -> list[bool]:
     return [bent and other for bent, other in zip(bent_meshes(faces.meshes, job.call.memory), others, strict=True)]
 
 
-def _flags(values: list[bool]) -> mi.UInt32:
+def flags(values: list[bool]) -> mi.UInt32:
+    """1 where true."""
     found = mi.UInt32([int(value) for value in values])
     dr.make_opaque(found)
     return found
@@ -106,7 +110,7 @@ def _lights(job: Job) -> Targets | None:
     """Balls around lights with a surface, and the whole circle under a sky; None if all are points or directions."""
     chosen = [(e, f) for e, f in zip(job.scene.emitters(), job.facts.emitters, strict=True) if not f.delta]
     if len(chosen) > MOST_LIGHTS:
-        return _all_around()
+        return all_around()
     spheres = []
     for emitter, facts in chosen:
         if facts.shape >= 0:
@@ -124,7 +128,8 @@ def _lights(job: Job) -> Targets | None:
     return targets
 
 
-def _all_around() -> Targets:
+def all_around() -> Targets:
+    """Directions all around."""
     targets = Targets(mi.Point3f(0), mi.Float(0), mi.UInt32(0))
     dr.make_opaque(targets)
     return targets
@@ -136,7 +141,7 @@ def _sources_move(job: Job, direct: bool) -> bool:
     return facts.shapes_move and (direct or job.form == "material")
 
 
-def _spread(face: Face) -> mi.Float:
+def spread(face: Face) -> mi.Float:
     """Mean sine of the angle between the corners' normals and the face."""
     n = dr.normalize(face.n_g)
     return sum(dr.norm(dr.cross(n, dr.normalize(n_s))) for n_s in face.n) / 3

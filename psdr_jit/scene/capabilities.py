@@ -121,9 +121,9 @@ _MOVING = "while geometry, a light's pose or the camera is differentiated; "
 SUPPORT = (
     Row("meshes (obj, ply, serialized, cube, ...)", "yes", "welded; what UVs, normals and colours do at seams is seen"),
     Row("smooth-shaded meshes", "yes",
-        "where normals turn away is an edge, and so is the plane of a face far off its normals; glowing meshes near "
-        "what they light: 1 to 5 % off, more if they turn in place; lights, mirrors, two-sided bodies and, under "
-        "point, spot and directional lights, any with normals far off their faces: warning"),
+        "where normals turn away is an edge, and so is the plane of a face far off its normals, and of any "
+        "that shines; glowing meshes of few faces that change in size: up to 1 % off; mirrors, two-sided bodies and, "
+        "under point, spot and directional lights, any with normals far off their faces: warning"),
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, SDF grids that are turned or have unequal numbers of values along "
         "the axes: error; smooth normals on fewer than 48 values a side: warning"),
