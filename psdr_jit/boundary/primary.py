@@ -33,7 +33,7 @@ from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
 from ..edges.table import look_beside
 from ..options import Options
-from ..paths.walk import NoSink, skip_emitters, walk
+from ..paths.walk import NoSink, see_through_emitters, walk
 from ..plan.job import Job
 from ..plan.motion import Displacements, Motion
 from ..plan.plan import Geometry
@@ -119,7 +119,7 @@ def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     blocked = job.scene.ray_test(ray, active)
     if job.options.hide_emitters:
         pi = job.scene.ray_intersect_preliminary(ray, active=active)
-        _, pi = skip_emitters(job.scene, ray, pi)
+        _, pi = see_through_emitters(job.scene, ray, pi)
         blocked = pi.is_valid()
     return compact(sample, active & ~blocked)
 
@@ -135,7 +135,7 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
-        ray, pi = skip_emitters(job.scene, ray, pi)
+        ray, pi = see_through_emitters(job.scene, ray, pi)
         emission = mi.Bool(False)
     L, _, surface = walk(job.scene, rng, ray, pi, job.limits_beside, NoSink(), emission, differs)
     L *= weight

@@ -175,13 +175,19 @@ def _as_seen(rows: EdgeRows, outside: mi.Float) -> EdgeRows:
 def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
     """1 for every mesh of which light paths from the sensor meet the outer side only, if it is closed; else 0.
 
-    Paths do not enter a closed opaque shape; they may start in it.
+    Paths do not enter a closed opaque shape; they may start in it, and pass through lights that are hidden.
     """
     lower, upper = origin_box(job.frame)
     flags = []
     for facts in meshes:
-        flags.append(float(facts.opaque and apart(lower, upper, edge_shapes(job).shapes[facts.index].bbox())))
+        outside = apart(lower, upper, edge_shapes(job).shapes[facts.index].bbox())
+        flags.append(float(facts.opaque and outside and not _is_hidden(job, facts)))
     return mi.Float(flags)
+
+
+def _is_hidden(job: Job, facts: ShapeFacts) -> bool:
+    """Does the sensor look through it?"""
+    return facts.is_emitter and job.options.hide_emitters
 
 
 def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[EdgeRows | None, mi.UInt32, int]:

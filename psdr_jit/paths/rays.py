@@ -15,6 +15,9 @@ SHADOW_EPSILON = 1e-3
 #: What is added for the rounding of float32 positions, relative to the coordinates: eight units in the last place.
 ROUNDING = 1e-6
 
+#: Distance that a ray advances beyond what it passes through, relative to the coordinates.
+ADVANCE = 1e-5
+
 
 def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
     """Is the emitter sample visible from `si`? Any-hit ray; returns `(hit, visible)` with an empty hit."""
@@ -38,17 +41,40 @@ def shadow_hit(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSam
     return Hit.of(ray, pi), active & dr.select(on_surface, reached, ~pi.is_valid())
 
 
-@dr.syntax
 def skip_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f):
-    """Pass straight through area emitters: the ray restarted behind the last one, and what it meets."""
+    """Pass through area emitters as images do: the ray restarted behind the last one, and what it meets.
+
+    Mitsuba lifts its origin off the surface, and so shifts the ray to the side.
+    """
+    return _behind_emitters(scene, ray, pi, _lifted)
+
+
+def see_through_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f):
+    """The same along the line itself: what rays meet that aim at an edge, or pass by it at a smaller distance."""
+    return _behind_emitters(scene, ray, pi, _advanced)
+
+
+def _lifted(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> mi.Ray3f:
+    behind = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal).spawn_ray(ray.d)
+    # its origin lies off the surface: measured from there, or rays would end as much later
+    behind.maxt = ray.maxt - dr.dot(behind.o - ray.o, ray.d)
+    return behind
+
+
+def _advanced(ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f) -> mi.Ray3f:
+    behind = mi.Ray3f(ray)
+    t = pi.t + ADVANCE * (1 + dr.max(dr.abs(ray.o)) + pi.t)
+    behind.o, behind.maxt = ray(t), ray.maxt - t
+    return behind
+
+
+@dr.syntax
+def _behind_emitters(scene: mi.Scene, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, restarted):
     ray = mi.Ray3f(ray)
     pi = mi.PreliminaryIntersection3f(pi)
     active = pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (an array comparison)
-    while dr.hint(active, label="psdr.skip_emitters"):
-        behind = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal).spawn_ray(ray.d)
-        # its origin lies off the surface: measured from there, or rays would end as much later
-        behind.maxt = ray.maxt - dr.dot(behind.o - ray.o, ray.d)
-        ray = behind
+    while dr.hint(active, label="psdr.behind_emitters", exclude=[restarted]):
+        ray = restarted(ray, pi)
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
     return ray, pi

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, View
-from .rays import SHADOW_EPSILON, skip_emitters
+from .rays import SHADOW_EPSILON, see_through_emitters
 
 
 def on_film(frame: SensorFrame, view: View, margin: mi.Float | float = 0.0) -> mi.Bool:
@@ -26,5 +26,5 @@ def seen_by_sensor(
     ray = mi.Ray3f(view.o, view.ω)
     ray.maxt = view.r * (1 - SHADOW_EPSILON)
     pi = scene.ray_intersect_preliminary(ray, active=active)
-    _, pi = skip_emitters(scene, ray, pi)
+    _, pi = see_through_emitters(scene, ray, pi)
     return active & ~pi.is_valid()

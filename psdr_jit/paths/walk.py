@@ -20,11 +20,13 @@ import mitsuba as mi
 from ..core.records import Hit
 from .bounce import Bounce, PathLimits, PathState, evaluate_and_bounce
 from .light_technique import Trail
-from .rays import SHADOW_EPSILON, first_hit, interaction, skip_emitters
+from .rays import SHADOW_EPSILON, first_hit, interaction, see_through_emitters, skip_emitters
 from .sink import Emission, NextEvent, NoSink, Scatter, Sink
 
 #: All that a caller of the walk needs.
-__all__ = ["SHADOW_EPSILON", "NoSink", "PathLimits", "first_hit", "mis_weight", "skip_emitters", "walk"]
+__all__ = [
+    "SHADOW_EPSILON", "NoSink", "PathLimits", "first_hit", "mis_weight", "see_through_emitters", "skip_emitters", "walk",
+]  # fmt: skip
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:

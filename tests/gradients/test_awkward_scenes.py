@@ -219,6 +219,24 @@ def test_shadows_are_seen_through_a_hidden_light(llvm, kind):
     assert_grad_close(forward(motion, spec, SEEDS, 64), reference, 0.02)
 
 
+@pytest.mark.parametrize("height", [0.2, 0.5], ids=["halfway", "a corner"])
+def test_the_floor_inside_of_a_hidden_lamp(llvm, height):
+    """A glowing cube sunk into a floor: `hide_emitters` shows the dark floor within, up to where the cube cuts it.
+
+    Seen through the cube, the camera's rays are shifted to the side by more than what they look beside an edge.
+    """
+    pose = T().translate([-0.2, height, 0]).rotate([1, 0.5, 0.2], 40).scale(0.5)
+    lamp = {"type": "cube", "to_world": pose, "emitter": {"type": "area"}, "face_normals": True}
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(4), "bsdf": white()}
+    seen = camera((1.6, 1.3, 3.4), (-0.1, 0.3, 0), 42)
+    motion = perturb(scene(lamp=lamp, floor=floor, sky={"type": "constant"}, sensor=seen), "sensor.to_world", rotate=X)
+    spec = {"type": "psdr_path", "max_depth": 2, "hide_emitters": True}
+    reference = fd(motion, {**spec, "type": "path"}, 0.002, 32, 1024)
+    slope = gain(forward(motion, spec, 16, 256), reference[0::2], reference[1::2])
+    assert slope.stderr < 0.02
+    assert abs(slope.value - 1) < 0.02 + 3 * slope.stderr, slope
+
+
 def test_a_spherical_light_that_is_turned(llvm):
     """Casts the shadow of the same light before it was turned: Mitsuba's own normals of sampled points do not turn."""
 
