@@ -25,8 +25,15 @@ from .sink import Emission, NextEvent, NoSink, Scatter, Sink
 
 #: All that a caller of the walk needs.
 __all__ = [
-    "SHADOW_EPSILON", "NoSink", "PathLimits", "first_hit", "mis_weight", "see_through_emitters", "skip_emitters", "walk",
-]  # fmt: skip
+    "SHADOW_EPSILON",
+    "NoSink",
+    "PathLimits",
+    "first_hit",
+    "mis_weight",
+    "see_through_emitters",
+    "skip_emitters",
+    "walk",
+]
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
