@@ -44,3 +44,9 @@ def _by_host(kind: type, arrays: list[Any]) -> Any:
             dr.scatter(result, array, dr.arange(mi.UInt32, size) + start, mode=dr.ReduceMode.Permute)
         start += size
     return result
+
+
+def pointers(kind: type, objects: Sequence[Any]) -> Any:
+    """Pointers of type `kind` (`mi.ShapePtr`, ...) to `objects`, at least one of them; one entry each."""
+    objects = list(objects)
+    return kind(objects) if len(objects) > 1 else kind(objects[0])  # an array of one would be no literal

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.joining import pointers
 from ..core.upload import uploaded
 from ..scene.poses import Poses
 
@@ -78,8 +79,7 @@ def curve_set(shapes: list[tuple[mi.Shape, str]]) -> CurveSet:
     kind, owner = (uploaded(mi.UInt32, np.repeat(column, PIECES)) for column in curves.T)
     rows = CurveRows(kind, owner, uploaded(mi.Float, np.tile(np.arange(PIECES) / PIECES, len(curves))))
     owners = tuple(shape for shape, _ in shapes)
-    pointers = mi.ShapePtr(list(owners)) if len(owners) > 1 else mi.ShapePtr(owners[0])
-    return CurveSet(owners, pointers, rows)
+    return CurveSet(owners, pointers(mi.ShapePtr, owners), rows)
 
 
 def transform_point(columns: tuple[mi.Vector3f, ...], x: mi.Point3f) -> mi.Point3f:

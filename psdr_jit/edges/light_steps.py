@@ -19,7 +19,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
-from ..core.joining import joined
+from ..core.joining import joined, pointers
 from ..core.varying import varying
 from ..scene.poses import Poses
 from .curves import transform_point, transform_vector
@@ -117,8 +117,7 @@ class LightSteps:
         n_perp = dr.select(across > 0, side / across, 0)
         n_perp *= dr.select(dr.dot(n_perp, aside) < 0, -1.0, 1.0)
         across = dr.select(_is_lit(rows, t, films), across, 0)
-        pointers = mi.EmitterPtr(list(self.lights)) if len(self.lights) > 1 else mi.EmitterPtr(self.lights[0])
-        emitter = dr.gather(mi.EmitterPtr, pointers, rows.light)
+        emitter = dr.gather(mi.EmitterPtr, pointers(mi.EmitterPtr, self.lights), rows.light)
         return LightRay(
             emitter, mi.Point3f(columns[3]), d, n_perp, across / length, aside / length, dr.rcp(length)
         )  # fmt: skip

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, same_values, texcoords_buffer
-from ..core.joining import joined
+from ..core.joining import joined, pointers
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
@@ -96,8 +96,7 @@ def pattern_kinds(
             continue
         moves = _moves(chosen, lines)
         front, back = _seen_sides(job, chosen, found, lines)
-        pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
-        common = (pointers, centre, tuple(shapes))
+        common = (pointers(mi.ShapePtr, shapes), centre, tuple(shapes))
         if family == MESH:
             positions = dr.detach(attached_positions(tuple(shapes)))
             dr.eval(moves, front, back, positions)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_values
-from ..core.joining import joined
+from ..core.joining import joined, pointers
 from ..core.memory import Memory, Slot, key_of
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
@@ -104,7 +104,7 @@ def edge_set(
     rows, between, shared = divided(rows, solids, contacts, vertices)
     rows = join_coinciding(rows, moving, shared)
     junctions = find_junctions(solids, balls, memory)
-    shapes = mi.ShapePtr(list(meshes)) if len(meshes) > 1 else mi.ShapePtr(meshes[0])
+    shapes = pointers(mi.ShapePtr, meshes)
     dr.eval(rows)
     return EdgeSet(tuple(meshes), rows, shapes, junctions, between, tuple(contacts))
 

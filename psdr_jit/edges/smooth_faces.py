@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.joining import joined
+from ..core.joining import joined, pointers
 from ..core.memory import Memory
 from ..core.upload import uploaded
 from ..core.varying import varying
@@ -69,7 +69,7 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
         shell=joined([known_topology(mesh, memory).facing for mesh in chosen]) * dr.gather(mi.Float, outside, place),
         moves=dr.gather(mi.Bool, uploaded(mi.Bool, np.array(moving)), place),
     )
-    shapes = mi.ShapePtr(chosen) if len(chosen) > 1 else mi.ShapePtr(chosen[0])
+    shapes = pointers(mi.ShapePtr, chosen)
     found = SmoothFaces(
         tuple(chosen), shapes, rows, dr.detach(attached_positions(tuple(chosen))), dr.detach(_normals(tuple(chosen)))
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.joining import pointers
 from ..core.memory import Slot
 from ..core.sensor_frame import viewpoint
 from ..edges.coarse import bent_meshes
@@ -122,7 +123,7 @@ def _lights(job: Job) -> Targets | None:
     if not spheres:
         return None
     x, y, z, r = (mi.Float([s[k] for s in spheres]) for k in range(4))
-    emitters = mi.EmitterPtr([e for e, _ in chosen]) if len(chosen) > 1 else mi.EmitterPtr(chosen[0][0])
+    emitters = pointers(mi.EmitterPtr, [e for e, _ in chosen])
     targets = Targets(mi.Point3f(x, y, z), r, dr.reinterpret_array(mi.UInt32, emitters))
     dr.make_opaque(targets)
     return targets

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..core.compat import CONTROL_POINTS
 from ..core.ellipsoid import Ellipsoid
-from ..core.joining import joined
+from ..core.joining import joined, pointers
 from ..core.memory import Memory
 from ..core.rod import Rod
 from ..core.tube_axis import Axis
@@ -190,7 +190,7 @@ def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | No
     dr.eval(flat)
     tables = [uploaded(mi.UInt32, np.concatenate(a)) for a in (first, owner)]
     moves = tuple(s.moves for s in chosen)
-    pointers = mi.ShapePtr(shapes) if len(shapes) > 1 else mi.ShapePtr(shapes[0])
     extents = [np.array([mi.traverse(shape)["extent"] for shape in shapes])] if family is Ellipsoids else []
-    return family(tuple(shapes), pointers, moves, uploaded(mi.UInt32, start), uploaded(mi.UInt32, count), *tables,
-                  tuple(offsets), flat, *(uploaded(mi.Float, a) for a in extents))  # fmt: skip
+    return family(tuple(shapes), pointers(mi.ShapePtr, shapes), moves, uploaded(mi.UInt32, start),
+                  uploaded(mi.UInt32, count), *tables, tuple(offsets), flat,
+                  *(uploaded(mi.Float, a) for a in extents))  # fmt: skip
