@@ -29,6 +29,10 @@ class ParamInfo:
     reason: str = ""
 
 
+#: Why a shape may have lost its name.
+MERGED = "Mitsuba merges shapes: they keep their names if the scene is loaded with optimize=False"
+
+
 def differentiable_params(scene: Any, params: Any = None) -> list[ParamInfo]:
     """Describe every parameter of `scene`, in traversal order.
 
@@ -128,8 +132,12 @@ def _suggestion(name: str, known: list[str]) -> str:
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     close += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in close]
     if not close:
-        return "; 'psdr params SCENE.xml' lists them (shapes keep their names with optimize=False)"
-    return "; did you mean " + ", ".join(f"'{k}'" for k in close[:3]) + "?"
+        return f"; 'psdr params SCENE.xml' lists them ({MERGED})"
+    owner = name.rsplit(".", 1)[0]
+    unknown = not any(k.startswith(f"{owner}.") for k in known)
+    nameless = any(k.startswith("shape") and k.endswith(VERTEX_POSITIONS) for k in known)
+    hint = f" ({MERGED})" if unknown and nameless else ""
+    return "; did you mean " + ", ".join(f"'{k}'" for k in close[:3]) + "?" + hint
 
 
 def _describe(params: Any, name: str) -> ParamInfo:

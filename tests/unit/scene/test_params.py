@@ -79,6 +79,14 @@ def test_unknown_parameter_suggests_close_names(scene):
         find_param(scene, "box")
 
 
+def test_names_lost_in_merging_are_explained(variant):
+    """Two meshes of one material become a nameless one, unless the scene is loaded with optimize=False."""
+    cube = {"type": "cube", "bsdf": {"type": "diffuse"}}
+    scene = mi.load_dict({"type": "scene", "small": dict(cube), "large": dict(cube)})
+    with pytest.raises(ParameterError, match=r"loaded with optimize=False"):
+        find_param(scene, "small.vertex_positions")
+
+
 CURVES = [
     ("box.vertex_positions", dict(direction=(1, 2, 3))),
     ("box.vertex_positions", dict(rotate=(0, 2, 0))),
