@@ -8,26 +8,38 @@ import mitsuba as mi
 from ..core.records import Hit
 from .junctions import JunctionRows, Sheet
 
-#: Length of the ray by which a ball's surface point is addressed, relative to its coordinates.
+#: Length of the ray by which a point of a ball or cylinder is addressed, relative to its coordinates.
 PROBE = 1e-2
 
 
 def bend(rows: JunctionRows, index: mi.UInt32, x: mi.Point3f, dx: mi.Vector3f, active):
-    """Carry a point of an arc's chord and its derivative onto the circle; `index`: row of `rows`."""
+    """Carry a point of an arc's chord and its derivative onto the circle or ellipse; `index`: row of `rows`.
+
+    Within the plane of the face, away from its centre, until the distance from there, or from the cylinder's axis
+    through there, is the radius.
+    """
     radius = dr.gather(mi.Float, rows.arc_radius, index, active)
     on_arc = active & (radius > 0)
-    offset = x - dr.gather(mi.Point3f, rows.arc_centre, index, on_arc)
-    distance = dr.norm(offset)
-    axis = mi.Vector3f(offset / distance)
-    scale = radius / distance
+    offset = mi.Vector3f(x - dr.gather(mi.Point3f, rows.arc_centre, index, on_arc))
+    radial = _across(offset, dr.gather(mi.Vector3f, rows.arc_axis, index, on_arc))
+    scale = radius / dr.norm(radial)
     bent = x + (scale - 1) * offset
-    return dr.select(on_arc, bent, x), dr.select(on_arc, scale * (dx - axis * dr.dot(axis, dx)), dx)
+    slope = scale * (dx - offset * (dr.dot(radial, dx) / dr.squared_norm(radial)))
+    return dr.select(on_arc, bent, x), dr.select(on_arc, slope, dx)
+
+
+def _across(v: mi.Vector3f, axis: mi.Vector3f) -> mi.Vector3f:
+    """The part of v perpendicular to the unit vector `axis`; all of it if that is 0."""
+    return v - axis * dr.dot(v, axis)
 
 
 def junction_motion(rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Point3f, active) -> mi.Vector3f:
     """Vector of value 0 whose derivative is the velocity of the curve at x, attached to both surfaces."""
     sheets = [dr.gather(Sheet, sheet, index, active) for sheet in (rows.a, rows.b)]
-    n_a, n_b = (dr.select(s.is_ball, dr.normalize(mi.Vector3f(x - s.centre)), mi.Vector3f(s.n)) for s in sheets)
+    n_a, n_b = (
+        dr.select(s.is_round, dr.normalize(_across(mi.Vector3f(x - s.centre), s.axis)), mi.Vector3f(s.n))
+        for s in sheets
+    )
     moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, active)) for n, s in zip((n_a, n_b), sheets, strict=True))
     c = dr.dot(n_a, n_b)
     scale = dr.rcp(dr.squared_norm(dr.cross(n_a, n_b)))  # 1 − c² without cancellation

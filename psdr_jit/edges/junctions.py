@@ -26,11 +26,12 @@ from . import intersections as cut
 from .moved_along import segments_moved_along
 from .overlaps import box_of, crossing
 from .parts import crosses_itself, cut_parts
+from .round_cuts import ball_mesh, cylinder_mesh
 from .rows import EdgeRows
-from .solids import Ball, Solid, state_of, triangles
+from .solids import Ball, Drum, Solid, state_of, triangles
 from .topology import EdgeTopology
 
-#: Pieces into which the full circle of a ball in a plane is cut.
+#: Pieces into which the full circle of a ball, or ellipse of a cylinder, in a plane is cut.
 ARC_PIECES = 64
 
 #: By two shapes: their states, and the junctions found for these.
@@ -55,8 +56,9 @@ class Sheet:
     uv_start: mi.Point2f  # position on the primitive at both ends of the segment
     uv_end: mi.Point2f
     n: mi.Normal3f  # unit; outward where the surface is closed
-    centre: mi.Point3f  # of a ball
-    is_ball: mi.Bool
+    centre: mi.Point3f  # of a ball, or a point of the axis of a cylinder
+    axis: mi.Vector3f  # unit, of a cylinder; 0 for others
+    is_round: mi.Bool  # a ball or a cylinder
 
 
 @dataclass
@@ -65,6 +67,7 @@ class JunctionRows:
     b: Sheet
     arc_centre: mi.Point3f
     arc_radius: mi.Float  # 0: a straight segment
+    arc_axis: mi.Vector3f  # of the cylinder on which the arc is; 0 on balls
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,10 @@ class JunctionTable:
 
     edges: EdgeRows
     rows: JunctionRows
-    pairs: tuple[tuple[Solid, Solid | Ball], ...] = ()  # of what they are
+    pairs: tuple[tuple[Solid, Solid | Ball | Drum], ...] = ()  # of what they are
 
 
-def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> JunctionTable | None:
+def find_junctions(solids: list[Solid], balls: tuple[Ball | Drum, ...], memory: Memory) -> JunctionTable | None:
     """All intersection curves; None if there are none. Pairs whose shapes rest are taken from `memory`."""
     found, pairs, changed = [], [], False
     for a, b in _pairs(solids, balls, memory):
@@ -99,7 +102,9 @@ def find_junctions(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory)
     return replace(table[1], pairs=tuple(pairs))
 
 
-def _pairs(solids: list[Solid], balls: tuple[Ball, ...], memory: Memory) -> list[tuple[Solid, Solid | Ball]]:
+def _pairs(
+    solids: list[Solid], balls: tuple[Ball | Drum, ...], memory: Memory
+) -> list[tuple[Solid, Solid | Ball | Drum]]:
     """Pairs that may intersect, by their bounding boxes; at least one is a mesh. A mesh of several surfaces, or that
     cuts itself, pairs with itself.
     """
@@ -127,25 +132,35 @@ def _crosses(solid: Solid) -> bool:
         return False
 
 
-def _pair(a: Solid, b: Solid | Ball, memory: Memory) -> tuple | None:
+def _pair(a: Solid, b: Solid | Ball | Drum, memory: Memory) -> tuple | None:
     """Columns of the junctions of one pair, as NumPy arrays: `(start, end, sheet a, sheet b, arcs, a, b)`."""
     mesh_a = triangles(a)
-    if isinstance(b, Ball):
-        to_world = np.array(dr.detach(mi.traverse(b.shape)["to_world"].matrix), dtype=float).reshape(4, 4)
-        centre, radius = to_world[:3, 3], np.linalg.norm(to_world[:3, 0])
-        arcs = cut.ball_mesh(centre, radius, mesh_a, ARC_PIECES)
-        if len(arcs.face) == 0:
-            return None
-        middle = (arcs.start + arcs.end) / 2 - centre
-        n_b = middle / np.linalg.norm(middle, axis=1, keepdims=True)
-        sheet_a = _sheet(a, mesh_a, arcs.face, arcs.start, arcs.end)
-        return arcs.start, arcs.end, sheet_a, _ball_sheet(b, n_b, centre), (arcs.centre, arcs.radius), a, b
+    if not isinstance(b, Solid):
+        return _round(a, mesh_a, b)
     mesh_b = triangles(b)
     try:
         found = segments_moved_along((a, mesh_a), (b, mesh_b), memory, lambda: cut.mesh_mesh(mesh_a, mesh_b))
     except cut.TooManyPairs:
         return _too_many(f"shapes '{shown_name(a.mesh)}' and '{shown_name(b.mesh)}'")
     return _between(a, mesh_a, b, mesh_b, found)
+
+
+def _round(a: Solid, mesh: cut.TriangleMesh, b: Ball | Drum) -> tuple | None:
+    """As `_pair`, of a mesh and a round body."""
+    if isinstance(b, Ball):
+        centre, radius = b.place()
+        arcs = ball_mesh(centre, radius, mesh, ARC_PIECES)
+    else:
+        tube = b.tube()
+        centre, arcs = tube.base, cylinder_mesh(tube, mesh, ARC_PIECES)
+    if len(arcs.face) == 0:
+        return None
+    radial = (arcs.start + arcs.end) / 2 - centre
+    radial -= arcs.axis * np.einsum("ij,ij->i", radial, arcs.axis)[:, None]
+    n = radial / np.linalg.norm(radial, axis=1, keepdims=True)
+    sheet = _sheet(a, mesh, arcs.face, arcs.start, arcs.end)
+    curve = (arcs.centre, arcs.radius, arcs.axis)
+    return arcs.start, arcs.end, sheet, _round_sheet(b, n, centre, arcs.axis), curve, a, b
 
 
 def _within(solid: Solid, memory: Memory) -> tuple | None:
@@ -179,7 +194,7 @@ def _between(a: Solid, mesh_a: cut.TriangleMesh, b: Solid, mesh_b: cut.TriangleM
     if not steep.any():
         return None
     sheet_a, sheet_b = ({k: v[steep] for k, v in sheet.items()} for sheet in (sheet_a, sheet_b))
-    arcs = (np.zeros((steep.sum(), 3)), np.zeros(steep.sum()))
+    arcs = (np.zeros((steep.sum(), 3)), np.zeros(steep.sum()), np.zeros((steep.sum(), 3)))
     return found.start[steep], found.end[steep], sheet_a, sheet_b, arcs, a, b
 
 
@@ -199,22 +214,24 @@ def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.nda
         "uv_end": cut.barycentric(end, corners)[:, 1:],
         "n": n * np.where(shell < 0, -1, 1)[:, None],
         "centre": np.zeros((len(face), 3)),
-        "is_ball": np.zeros(len(face), bool),
+        "axis": np.zeros((len(face), 3)),
+        "is_round": np.zeros(len(face), bool),
         "shell": np.abs(shell),
         "index": np.full(len(face), solid.index),
     }
 
 
-def _ball_sheet(ball: Ball, n: np.ndarray, centre: np.ndarray) -> dict:
+def _round_sheet(body: Ball | Drum, n: np.ndarray, centre: np.ndarray, axis: np.ndarray) -> dict:
     count = len(n)
     return {
-        "shape": np.full(count, registry_index(ball.shape)),
+        "shape": np.full(count, registry_index(body.shape)),
         "prim": np.zeros(count, int),
         "uv_start": np.zeros((count, 2)),
         "uv_end": np.zeros((count, 2)),
         "n": n,
         "centre": np.broadcast_to(centre, (count, 3)),
-        "is_ball": np.ones(count, bool),
+        "axis": axis,
+        "is_round": np.ones(count, bool),
         "shell": np.zeros(count),  # its normal turns along an arc: nothing is pruned by it
         "index": np.zeros(count, int),
     }
@@ -224,7 +241,7 @@ def _upload(found: list[tuple]) -> JunctionTable:
     """Concatenate the pairs and turn them into device arrays."""
     start, end = (np.concatenate([f[k] for f in found]) for k in (0, 1))
     a, b = ({key: np.concatenate([f[k][key] for f in found]) for key in found[0][k]} for k in (2, 3))
-    centre, radius = (np.concatenate([f[4][k] for f in found]) for k in (0, 1))
+    centre, radius, axis = (np.concatenate([f[4][k] for f in found]) for k in (0, 1, 2))
     moves = np.concatenate([np.full(len(f[0]), f[5].moves or f[6].moves) for f in found])
     # The halves of the faces in front of each other make a concave edge if the edge runs along n_b × n_a.
     along = np.einsum("ij,ij->i", end - start, np.cross(b["n"], a["n"])) >= 0
@@ -236,7 +253,7 @@ def _upload(found: list[tuple]) -> JunctionTable:
             np.where(swap, sheet["uv_start"], sheet["uv_end"]),
         )
     count = len(start)
-    arc = radius > 0
+    arc = a["is_round"] | b["is_round"]
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", a["n"], b["n"]), -1, 1))
     zeros = uploaded(mi.UInt32, np.zeros(count, np.uint32))
     none = mi.Vector2u(zeros, zeros)
@@ -249,10 +266,11 @@ def _upload(found: list[tuple]) -> JunctionTable:
         traced=_flags(count, True), moves=uploaded(mi.Bool, moves),
         shell0=uploaded(mi.Float, np.where(arc, 0, a["shell"])),
         shell1=uploaded(mi.Float, np.where(arc, 0, b["shell"])),
-        shape0=_index(a["index"]), shape1=_index(np.where(b["is_ball"], a["index"], b["index"])),
+        shape0=_index(a["index"]), shape1=_index(np.where(b["is_round"], a["index"], b["index"])),
         prim0=_index(a["prim"]), prim1=_index(b["prim"]), corner0=none, corner1=mi.Vector2u(none),
     )  # fmt: skip
-    rows = JunctionRows(_device_sheet(a), _device_sheet(b), _point(centre), uploaded(mi.Float, radius))
+    rows = JunctionRows(_device_sheet(a), _device_sheet(b), _point(centre), uploaded(mi.Float, radius),
+                        mi.Vector3f(_point(axis)))  # fmt: skip
     dr.eval(edges, rows)
     return JunctionTable(edges, rows)
 
@@ -260,7 +278,8 @@ def _upload(found: list[tuple]) -> JunctionTable:
 def _device_sheet(s: dict) -> Sheet:
     return Sheet(
         _index(s["shape"]), _index(s["prim"]), _point2(s["uv_start"]), _point2(s["uv_end"]),
-        mi.Normal3f(_point(s["n"])), _point(s["centre"]), uploaded(mi.Bool, s["is_ball"]),
+        mi.Normal3f(_point(s["n"])), _point(s["centre"]), mi.Vector3f(_point(s["axis"])),
+        uploaded(mi.Bool, s["is_round"]),
     )  # fmt: skip
 
 

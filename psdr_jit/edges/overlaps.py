@@ -60,7 +60,7 @@ def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, 
     for i, j in pairs:
         (a, kind_a), (b, kind_b) = shapes[i], shapes[j]
         curved = [kind for kind in (kind_a, kind_b) if kind in ANALYTIC]
-        covered = not curved or curved == ["sphere"]
+        covered = not curved or curved in (["sphere"], ["cylinder"])
         covered |= curved == ["sphere", "sphere"] and _apart(box_of(a), box_of(b))
         key = (key_of(a), key_of(b))
         if not covered and key not in memory[SAID] and cut_each_other(shapes[i], shapes[j]):
@@ -70,8 +70,8 @@ def warn_about_pairs(shapes: list[tuple[mi.Shape, str]], pairs: list[tuple[int, 
         others = f", and {len(found) - NAMED} other pairs" if len(found) > NAMED else ""
         warnings.warn(
             f"shapes {', '.join(found[:NAMED])}{others} cut into each other: the curve where they meet is found for "
-            "meshes and for a sphere in a mesh only, its part of the derivative is missing; replace curved shapes by "
-            "meshes",
+            "meshes and for a sphere or cylinder in a mesh only, its part of the derivative is missing; replace curved "
+            "shapes by meshes",
             UnsupportedWarning,
             stacklevel=2,
         )

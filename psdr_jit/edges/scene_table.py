@@ -46,7 +46,7 @@ from .scene_grids import scene_grids
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import smooth_faces
-from .solids import Ball
+from .solids import Ball, Drum
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -58,6 +58,10 @@ STRAIGHT: Slot[tuple[list, tuple[list[bool], list[bool]], EdgeSet] | None] = Slo
 
 #: Values along an axis of a grid from which the band along outlines, in which blended normals turn away, is narrow.
 FINE = 48
+
+
+#: Bodies whose curves with meshes are looked for.
+ROUND = {"sphere": Ball, "cylinder": Drum}
 
 
 def scene_edges(job: Job) -> EdgeTable:
@@ -78,7 +82,7 @@ def edge_table(job: Job) -> EdgeTable:
     warn_about_pairs(bodies, pairs, job.call.memory)
     overlapping = [chosen[k] for k in sorted({k for pair in pairs for k in pair}) if k < len(chosen)]
     centre = varying(mi.Point3f, list(job.scene.bbox().center()))
-    balls = tuple(Ball(shapes[s.index], s.moves) for s in analytic if s.plugin == "sphere")
+    balls = tuple(ROUND[s.plugin](shapes[s.index], s.moves) for s in analytic if s.plugin in ROUND)
     straight = _edge_set(job, meshes, balls)
     warn_about_parting(job, straight.contacts)
     kinds, hidden = _between_faces(job, straight, meshes, overlapping, centre)
@@ -121,7 +125,7 @@ def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:
             warn_once(message, UnsupportedWarning, job.call.memory)
 
 
-def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball, ...]) -> EdgeSet:
+def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball | Drum, ...]) -> EdgeSet:
     """Edges of the meshes; kept from call to call while these stay as they are: views of one scene share them."""
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     moving, painted = [s.moves for s in meshes], [s.painted for s in meshes]

@@ -29,7 +29,7 @@ from .parts import Part, parts_of
 from .rows import EdgeRows
 from .seams import corner_vertex, is_smooth, split_seams
 from .shells import edge_shells
-from .solids import Ball, Solid
+from .solids import Ball, Drum, Solid
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 
 #: Exterior angle below which two flat-shaded faces count as one [rad].
@@ -75,7 +75,7 @@ def edge_set(
     meshes: list[mi.Mesh],
     moving: list[bool],
     memory: Memory,
-    balls: tuple[Ball, ...] = (),
+    balls: tuple[Ball | Drum, ...] = (),
     seams: list[mi.Bool | None] | None = None,
     painted: list[bool] | None = None,
 ) -> EdgeSet:

@@ -1,4 +1,4 @@
-"""Meshes and balls that may touch or cut into each other, and in which state they are."""
+"""Meshes, balls and cylinders that may touch or cut into each other, and in which state they are."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from ..core.compat import faces_buffer, positions_buffer
 from .intersections import TriangleMesh
 from .overlaps import box_of
 from .parts import Part
+from .round_cuts import Tube
 from .topology import EdgeTopology
 
 
@@ -34,6 +35,25 @@ class Ball:
     shape: mi.Shape
     moves: bool
 
+    def place(self) -> tuple[np.ndarray, float]:
+        """Centre and radius, on the host."""
+        to_world = _matrix(self.shape)
+        return to_world[:3, 3], float(np.linalg.norm(to_world[:3, 0]))
+
+
+@dataclass(frozen=True)
+class Drum:
+    """An analytic cylinder."""
+
+    shape: mi.Shape
+    moves: bool
+
+    def tube(self) -> Tube:
+        """Its place, on the host."""
+        columns = _matrix(self.shape)[:3].T
+        height, radius = (np.linalg.norm(columns[k]) for k in (2, 0))
+        return Tube(columns[3], columns[2] / height, height, radius)
+
 
 @dataclass(frozen=True)
 class State:
@@ -43,11 +63,17 @@ class State:
     buffer: mi.Float | None
 
 
-def state_of(item: Solid | Ball) -> State:
+def state_of(item: Solid | Ball | Drum) -> State:
     if isinstance(item, Ball):
         return State((item.moves, *box_of(item.shape).ravel()), None)
+    if isinstance(item, Drum):
+        return State((item.moves, *_matrix(item.shape).ravel()), None)
     buffer = dr.detach(positions_buffer(item.mesh))
     return State((item.moves, item.index, buffer.index), buffer)
+
+
+def _matrix(shape: mi.Shape) -> np.ndarray:
+    return np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), dtype=float).reshape(4, 4)
 
 
 def triangles(solid: Solid) -> TriangleMesh:

@@ -157,10 +157,10 @@ SUPPORT = (
     Row("films that convert samples themselves (specfilm)", "error", ""),
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
     Row("non-manifold edges, duplicate and collapsed faces", "yes", "faces with three corners in a row: warning"),
-    Row("meshes that cut into each other, a sphere in a mesh", "yes",
+    Row("meshes that cut into each other, a sphere or cylinder in a mesh", "yes",
         "the curve where they meet, also of parts of one mesh; smooth-shaded lights that touch others, lights in "
         "windows or masks: warning"),
-    Row("cylinders, disks, spheres, curves, SDF grids and ellipsoids that cut into other shapes", "warning",
+    Row("disks, curves, SDF grids, ellipsoids that cut into others; spheres, cylinders into each other", "warning",
         "the pair is named; meshes do instead"),
     Row("scenes less than 0.1 units across", "warning", _MOVING + "Mitsuba's ray offsets are absolute lengths"),
     Row("scenes ten times as far from the origin as large", "warning", _MOVING + "rounding, in Mitsuba's path as well"),

@@ -38,11 +38,13 @@ CASES = {
     "cube-floor-turns": ("cube", "floor.to_world", None, (1, 0, 0.3)),
     "ball-up": ("sphere", "thing.to_world", (0, 1, 0), None),
     "ball-floor-turns": ("sphere", "floor.to_world", None, (1, 0, 0.3)),
+    "tube-up": ("cylinder", "thing.to_world", (0, 1, 0), None),
+    "tube-turns": ("cylinder", "thing.to_world", None, (1, 0.2, 0)),
     "ball-floor-slides": ("sphere", "floor.to_world", (1, 0, 0), None),
 }
 
 
-SLOW = ("cube-up", "ball-up", "cube-turns", "cube-floor-turns")  # the same pieces as the others
+SLOW = ("cube-up", "ball-up", "cube-turns", "cube-floor-turns", "tube-up")  # the same pieces as the others
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks import meshes
 from psdr_jit.edges import intersections as cut
+from psdr_jit.edges import round_cuts
 from psdr_jit.edges.near_pairs import near_pairs
 from psdr_jit.edges.topology import build_edge_topology
 
@@ -87,7 +88,7 @@ def test_too_dense(monkeypatch):
 
 @pytest.mark.parametrize("height", [0.0, 0.3, -0.6])
 def test_ball_in_a_floor(height):
-    found = cut.ball_mesh(np.array([0.2, height, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
+    found = round_cuts.ball_mesh(np.array([0.2, height, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
     size = np.sqrt(0.8**2 - height**2)
     half = np.linalg.norm(found.end - found.start, axis=1) / 2 / found.radius
     assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(2 * np.pi * size, rel=1e-9)
@@ -97,14 +98,14 @@ def test_ball_in_a_floor(height):
 
 def test_ball_over_the_border_of_a_floor():
     """Half of the circle lies beside the plane."""
-    found = cut.ball_mesh(np.array([3.0, 0, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
+    found = round_cuts.ball_mesh(np.array([3.0, 0, 0.1]), 0.8, mesh(SQUARE, SQUARE_FACES), 64)
     half = np.linalg.norm(found.end - found.start, axis=1) / 2 / found.radius
     assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(np.pi * 0.8, rel=1e-9)
     assert found.start[:, 0].max() <= 3 + 1e-9
 
 
 def test_touching_ball():
-    assert len(cut.ball_mesh(np.array([0, 0.8, 0]), 0.8, mesh(SQUARE, SQUARE_FACES), 64).face) == 0
+    assert len(round_cuts.ball_mesh(np.array([0, 0.8, 0]), 0.8, mesh(SQUARE, SQUARE_FACES), 64).face) == 0
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.9, 1.1])
@@ -114,12 +115,43 @@ def test_a_ball_looks_at_few_faces_of_a_fine_mesh(distance, monkeypatch):
     unit = mesh((points - meshes.CENTRE) / meshes.RADIUS, faces)
     looked, barycentric = set(), cut.barycentric
     monkeypatch.setattr(cut, "barycentric", lambda x, face: looked.add(face.tobytes()) or barycentric(x, face))
-    found = cut.ball_mesh(np.array([distance, 0, 0]), 1.2, unit, 64)
+    found = round_cuts.ball_mesh(np.array([distance, 0, 0]), 1.2, unit, 64)
     height = (distance**2 + 1.2**2 - 1) / (2 * distance) if distance else 1.2  # of the circle's plane, from the ball
     expected = 2 * np.pi * np.sqrt(1.2**2 - height**2)
     half = np.linalg.norm(found.end - found.start, axis=1) / 2 / np.maximum(found.radius, 1e-9)
     assert (2 * found.radius * np.arcsin(half)).sum() == pytest.approx(expected, rel=0.01)
     assert len(looked) < len(faces) / 20
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.4, 1.2])
+def test_cylinder_in_a_floor(lean):
+    """An ellipse with the half axes R and R / cos(lean): its points lie on both, and its length is an integral."""
+    axis = np.array([np.sin(lean), np.cos(lean), 0])
+    tube = round_cuts.Tube(np.array([0.2, 0, 0.1]) - axis, axis, 2.0, 0.3)
+    found = round_cuts.cylinder_mesh(tube, mesh(SQUARE, SQUARE_FACES), 4000)
+    offset = found.start - tube.base
+    radial = offset - (offset @ axis)[:, None] * axis
+    assert np.allclose(np.linalg.norm(radial, axis=1), 0.3) and np.allclose(found.start[:, 1], 0)
+    θ = np.linspace(0, 2 * np.pi, 100001)
+    ellipse = 0.3 * np.hypot(np.sin(θ) / np.cos(lean), np.cos(θ)).mean() * 2 * np.pi
+    assert np.linalg.norm(found.end - found.start, axis=1).sum() == pytest.approx(ellipse, rel=1e-4)
+
+
+def test_cylinder_that_ends_in_a_floor():
+    """Nothing of the curve lies beyond its height."""
+    tube = round_cuts.Tube(np.array([0, -1.0, 0]), np.array([0.6, 0.8, 0]), 1.25, 0.3)
+    found = round_cuts.cylinder_mesh(tube, mesh(SQUARE, SQUARE_FACES), 64)
+    along = (np.concatenate([found.start, found.end]) - tube.base) @ tube.axis
+    assert len(found.face) and along.max() == pytest.approx(1.25) and along.min() < 1.25
+
+
+def test_cylinder_that_lies_in_a_floor():
+    """Two straight lines of its length, apart by the chord."""
+    tube = round_cuts.Tube(np.array([-0.5, 0.1, 0.2]), np.array([1.0, 0, 0]), 1.0, 0.3)
+    found = round_cuts.cylinder_mesh(tube, mesh(SQUARE, SQUARE_FACES), 64)
+    assert np.linalg.norm(found.end - found.start, axis=1).sum() == pytest.approx(2.0)
+    assert not found.radius.any()
+    assert np.ptp(found.start[:, 2]) == pytest.approx(2 * np.sqrt(0.3**2 - 0.1**2))
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.3])

@@ -52,7 +52,7 @@ def warnings_about(found) -> int:
 
 def test_uncovered_pairs_are_named_once(llvm):
     T = mi.ScalarTransform4f
-    found = shapes(tube=("cylinder", T()), floor=("rectangle", T().translate([0, 0, 0.5]).scale(3)),
+    found = shapes(tube=("cylinder", T()), floor=("disk", T().translate([0, 0, 0.5]).scale(3)),
                    box=("cube", T().translate([0, 0, 9])))  # fmt: skip
     said = Memory()
     with pytest.warns(UnsupportedWarning, match="'tube' .cylinder. and 'floor'") as caught:
@@ -76,6 +76,7 @@ def test_covered_pairs_are_not_named(llvm):
     T = mi.ScalarTransform4f
     found = shapes(ball=("sphere", T()), floor=("rectangle", T().scale(3)), box=("cube", T().translate([0.3, 0, 0])))
     assert warnings_about(found) == 0
+    assert warnings_about(shapes(tube=("cylinder", T()), floor=("rectangle", T().translate([0, 0, 0.5]).scale(3)))) == 0
 
 
 @pytest.mark.parametrize(("height", "count"), [(0.72, 0), (0.6, 1), (-0.5, 1)])
