@@ -7,6 +7,7 @@ import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
 from psdr_jit.core import film as films
+from psdr_jit.core.ad import leftovers_named
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
 from psdr_jit.core.threads import alone
@@ -87,7 +88,7 @@ class TermIntegrator(ADIntegrator):
         return side_by_side([self._forward(part) for part in parts])
 
     def _forward(self, call: Call):
-        with alone():
+        with alone(), leftovers_named():
             prepared = self._prepared(call)
             images = {term.name: term.forward(job) for term, job in prepared.jobs}
             prepared.observe(call.seed, images)

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import drjit as dr
+
+from psdr_jit.errors import UnsupportedError
+
+#: What Dr.Jit says of a value in a loop that was computed outside of it from attached variables.
+COMPUTED_OUTSIDE = "outside of the current dr.isolate_grad() scope"
 
 
 def tangents(*values):
@@ -27,3 +35,25 @@ def backpropagate(image, grad_in) -> None:
     dr.set_grad(image, grad_in)
     dr.enqueue(dr.ADMode.Backward, image)
     dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearVertices)
+
+
+@contextmanager
+def leftovers_named() -> Iterator[None]:
+    """Raise an `UnsupportedError` that names the way out where Dr.Jit meets what a loop has left attached.
+
+    Its virtual calls reach every scene that is alive, and forward mode follows their parameters back to what these were
+    computed from; so it does with Mitsuba's own integrators.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        cause: BaseException | None = error
+        while cause is not None and COMPUTED_OUTSIDE not in str(cause):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise UnsupportedError(
+            "a parameter of this scene, or of another one that is alive, is still attached to what it was computed "
+            "from, as loops of optimisation leave it, and forward mode cannot tell it from those it is about: detach "
+            "it (params[key] = dr.detach(params[key]); params.update()), or delete its scene and params"
+        ) from error
