@@ -25,7 +25,8 @@ from .searched_lines import SearchedLines, either
 NARROWEST = 2.0**-10
 
 #: Width at which halving ends [px], or relative to the film: some units in the last place of a float32 film position.
-LEAST_WIDTH, ROUNDING = 2.0**-12, 5e-7
+#: What a ball mirrors closer than that to its outline is missing: its share of a pixel goes by the root of the width.
+LEAST_WIDTH, ROUNDING = 2.0**-16, 5e-7
 
 
 @dataclass

@@ -5,7 +5,8 @@ With --check the derivative is compared with finite differences; the exit status
 
     psdr params scenes/cbox.xml                                                    # names for --wrt
     psdr gradient scenes/cbox.xml --wrt small-box.vertex_positions --direction 1,0,0          # the box moves along x
-    psdr gradient scenes/cbox.xml --wrt light.to_world --rotate 0,1,0 --check                 # the light turns about y
+    psdr gradient scenes/cbox.xml -D res=32 --wrt small-box.vertex_positions --direction 1,0,0 --spp 16 --check
+    psdr gradient scenes/cbox.xml --wrt light.to_world --rotate 0,1,0                         # the light turns about y
 
 A parameter of several numbers, such as positions or a pose, needs one of --direction, --rotate and --index.
 """

@@ -16,6 +16,7 @@ from psdr_jit.cluster.source import SceneFile
 from psdr_jit.core.progress import reporting
 from psdr_jit.core.threads import one_at_a_time
 from psdr_jit.derivative import show
+from psdr_jit.derivative.images import colours
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.remote import RemoteTerms
 from psdr_jit.derivative.sampler import PRIMAL, TOTAL, DerivativeSampler, Terms
@@ -60,13 +61,20 @@ class GradientResult:
         """Names of the last channels, those that are no colours."""
         return Aovs.parse(self.integrator.get("aovs", "")).channels
 
+    def colours(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Total and terms by name, with their standard errors, of colours: `aovs` have other units."""
+        found = {"total": (self.total, self.total_stderr)}
+        found |= {name: (image, self.term_stderr[name]) for name, image in self.terms.items()}
+        return {name: tuple(colours(image, self.aovs) for image in pair) for name, pair in found.items()}
+
     def __repr__(self) -> str:
-        """One line a term instead of the arrays."""
+        """One line a term instead of the arrays, of colours alone."""
         plugin, count = self.integrator.get("type", "integrator"), f"{self.seeds} seed{'s' if self.seeds > 1 else ''}"
         lines = [f"d image / d {self.param}, {self.direction}",
                  f"  {plugin}, {count} x {self.spp} spp, {self.seconds:.1f} s",
-                 _line("total", self.total, self.total_stderr)]
-        lines += [_line(name, image, self.term_stderr[name]) for name, image in self.terms.items()]
+                 *(_line(name, *pair) for name, pair in self.colours().items())]
+        if self.aovs:
+            lines.append(f"  of colours; {', '.join(self.aovs)} are in the images as well")
         if self.seeds < 2:
             lines.append("  no standard errors: they come from the scatter of two seeds or more")
         if self.rejected:

@@ -152,7 +152,8 @@ def _motion(common: dict, base: Any, direction: Any, rotate: Any) -> Perturbatio
                              "(--direction / --rotate on the command line)")
     vector = _numbers(direction if rotate is None else rotate, "the direction of motion")
     if vector.size != 3:
-        raise ParameterError(f"the direction of '{name}' must have 3 numbers, got {vector.size}")
+        raise ParameterError(f"the direction of '{name}' must have 3 numbers, or as many as the parameter itself, "
+                             f"got {vector.size}")
     centre, extent = _pivot(common, base)
     length = float(np.linalg.norm(vector))
     words = ", ".join(f"{x:g}" for x in vector)

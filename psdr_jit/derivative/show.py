@@ -30,10 +30,8 @@ def gradient_png(result: Any) -> bytes:
 
 def gradient_html(result: Any) -> str:
     """The picture, and the size of every term beside its error."""
-    named = {"total": (result.total, result.total_stderr)}
-    named |= {name: (image, result.term_stderr[name]) for name, image in result.terms.items()}
     rows = [(name, f"{image.mean():.3e}", f"{_rms(image):.3e}", _known(_rms(stderr)))
-            for name, (image, stderr) in named.items()]  # fmt: skip
+            for name, (image, stderr) in result.colours().items()]  # fmt: skip
     plugin, several = result.integrator.get("type", "integrator"), "s" if result.seeds > 1 else ""
     about = f"{result.direction} · {plugin}, {result.seeds} seed{several} × {result.spp} spp, {result.seconds:.1f} s"
     parts = [markup.picture(gradient_png(result), "primal image, derivative and its terms"),

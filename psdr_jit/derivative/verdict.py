@@ -50,6 +50,10 @@ def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *,
     return Verdict(decision, reason, slope.value, slope.stderr, test.rms_z, test.max_z, test.blocks)
 
 
+#: What helps where noise decides.
+MORE = "allow more seconds, or take fewer pixels"
+
+
 @dataclass(frozen=True)
 class _Rule:
     """What counts as right; see `check_gradient`."""
@@ -64,7 +68,8 @@ def _decide(slope: Gain, test: BlockTest, images: tuple[GroupedImages, ...], blo
     """`(decision, reason)`; `images`: the estimate and two halves of finite differences."""
     seeds = min(group.total for group in images)
     if seeds < MIN_SEEDS:
-        return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds"
+        return INCONCLUSIVE, (f"fewer than {MIN_SEEDS} seeds of the estimate or of differences: allow more seconds, "
+                              "or take fewer samples or pixels")
     if rule.zero_bound is not None:
         return _judge_zero(*images, block, rule.zero_bound)
     if slope.power == 0 and not images[0].mean().any():
@@ -98,7 +103,7 @@ def _judge_gain(slope: Gain, test: BlockTest, seeds: int, tolerance: float, max_
     if test.max_z > MAX_Z:
         return FAIL, f"a block is off by {test.max_z:.1f} standard errors, limit {MAX_Z:g}"
     if not precise:
-        return INCONCLUSIVE, f"standard error of the gain is {slope.stderr:.4f}, needs {max_stderr:g}"
+        return INCONCLUSIVE, f"standard error of the gain is {slope.stderr:.4f}, needs {max_stderr:g}: {MORE}"
     if np.isfinite(test.rms_z) and not RMS_Z[0] <= test.rms_z <= RMS_Z[1]:
         return FAIL, f"RMS z {test.rms_z:.2f} is outside {RMS_Z[0]} to {RMS_Z[1]}"
     return PASS, f"gain within {tolerance:g}, errors as measured"

@@ -184,6 +184,9 @@ def _obstacle(name: str, value: Any) -> str:
     if not dr.is_array_v(value):
         return f"a value of type {kind} carries no derivative"
     if not dr.is_float_v(value):
+        if name.endswith(".data"):
+            return (f"the texture is stored in whole numbers ({kind}): load it as numbers that have derivatives, by "
+                    '<string name="format" value="variant"/> in the bitmap')
         return f"it holds whole numbers ({kind}), for example face indices"
     if dr.width(value) == 0 or 0 in dr.shape(value):
         return "it is an empty buffer: this shape does not have it"

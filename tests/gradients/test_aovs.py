@@ -142,3 +142,13 @@ def test_face_normals_of_smooth_meshes_are_refused(llvm):
     Aovs.parse("g:geo_normal").require_edges(scene_of("point_shadow"))
     with pytest.raises(UnsupportedError, match="smooth mesh 'ball'"):
         Aovs.parse("g:geo_normal").require_edges(scene_of("smooth_mesh"))
+
+
+def test_the_summary_is_of_colours(llvm):
+    """Depths and normals have other units."""
+    plain, more = (
+        repr(psdr_jit.gradient(scene_of("area_shadow"), BOX, (1, 0, 0), integrator=spec, spp=4, seeds=1)).splitlines()
+        for spec in ({"type": "psdr_path", "max_depth": 1}, spec_of("dd:depth, nn:sh_normal"))
+    )
+    assert plain[2] == more[2]  # the total
+    assert any("dd.T" in line for line in more)

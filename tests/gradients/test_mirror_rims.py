@@ -144,3 +144,26 @@ def test_forward_and_backward_agree_on_what_a_floor_sees(llvm):
     integrator = integrator_specs.build(spec(3, sppc=0, sppp=0, sppd=0, spps=0, sppi=64))
     wJv, JTwv, w, Jv = adjoint_identity(over_a_floor(sphere(12, bsdf=BRIGHT)), "ball.vertex_positions", integrator)
     assert Jv > 1e-3 and abs(wJv - JTwv) <= 1e-6 * w * Jv
+
+
+def test_a_border_mirrored_at_the_very_rim(llvm):
+    """The border of a floor passes behind a ball; what the ball mirrors of it leaves its outline at a tangent.
+
+    The closer to the outline, the less of it is found: half was missing where halving ended at 2^-12 px.
+    """
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 20, "height": 20, "pixel_format": "luminance"}
+    seen = T().look_at(origin=[0, 2.5, 5], target=[0, 0.6, 0], up=[0, 1, 0])
+    scene = mi.load_dict({
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 45, "to_world": seen, "film": film},
+        "floor": {"type": "rectangle", "to_world": T().scale(3).rotate([1, 0, 0], -90), "bsdf": {"type": "diffuse"}},
+        "ball": {"type": "sphere", "center": [0.8, 0.6, 0.2], "radius": 0.55, "bsdf": {"type": "conductor"}},
+        "lamp": {"type": "point", "position": [0.5, 3.5, 0], "intensity": 12.0},
+    }, optimize=False)  # fmt: skip
+    motion = perturb(scene, "ball.to_world", (0, 1, 0))
+    estimate = forward(motion, {"type": "psdr_path", "max_depth": 3}, 8, 256).mean(0)
+    reference = fd(motion, {"type": "path", "max_depth": 3}, 0.004, 8, 8192).mean(0)
+    at_rim = [(7, 15), (8, 14), (7, 12)]
+    ratio = sum(estimate[p] for p in at_rim) / sum(reference[p] for p in at_rim)
+    assert 0.85 < float(ratio[0]) < 1.03
