@@ -34,7 +34,7 @@ from ..edges.film_cover import LENS_CENTRE
 from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.location import EdgeLocation
-from ..paths.smooth_lights import SmoothLights
+from ..paths.smooth_lights import pdf_of_sample
 from ..plan.job import Job
 from ..sampling.horizons import SampledHorizons
 from ..sampling.light_horizons import sampled_light_horizons
@@ -96,7 +96,7 @@ def _weighed_cosine(job: Job, ray: mi.Ray3f, pi, light: mi.SurfaceInteraction3f,
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
     si.wi = si.to_local(dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(si.p)))
-    e2 = dr.square(SmoothLights(job.scene, alone=True).pdf_of_sample(si, light, -ray.d, active))
+    e2 = dr.square(pdf_of_sample(job.scene, si, light, -ray.d, active))
     b2 = dr.square(si.bsdf().pdf(mi.BSDFContext(), si, si.to_local(-ray.d), active))
     w = dr.select(e2 > 0, e2 / (b2 + e2), 0)
     return dr.abs_dot(light.sh_frame.n, ray.d) * dr.select(dr.isfinite(w), w, 0)

@@ -50,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check", action="store_true", help="compare with finite differences as well")
     parser.add_argument("--check-seconds", type=float, default=120, metavar="S",
                         help="time limit of the check (default: 120)")
+    parser.add_argument("--check-step", type=float, metavar="EPS",
+                        help="step of its differences (default: chosen, and made smaller where it may be the cause)")
     common.add_integrator_argument(parser)
     common.add_cluster_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="print only errors and the check's verdict")
@@ -58,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render, write, check; 0, or 1 for a check that did not pass."""
     common.require_positive(spp=args.spp, seeds=args.seeds, max_depth=args.max_depth,
-                             check_seconds=args.check_seconds)
+                             check_seconds=args.check_seconds, check_step=args.check_step)
     from psdr_jit.derivative import integrator_specs
     from psdr_jit.derivative.gradient import gradient
     from psdr_jit.derivative.perturbation import perturb
@@ -110,6 +112,6 @@ def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, 
     from psdr_jit.derivative.check import check_gradient
 
     result = check_gradient(scene, parameter, integrator=spec, spp=args.spp, sensor=args.sensor,
-                            max_seconds=args.check_seconds, progress=not args.quiet, **who)
+                            max_seconds=args.check_seconds, eps=args.check_step, progress=not args.quiet, **who)
     print(result)
     return OK if result.passed else CHECK_FAILED

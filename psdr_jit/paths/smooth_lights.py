@@ -57,15 +57,16 @@ class SmoothLights:
         n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
         usable = active & light.is_valid() & (n_g > GRAZING_FLAT) & (n_s > GRAZING_FLAT)
         ρ = dr.select(usable, n_s / n_g, 1)
-        e2 = dr.square(self.pdf_of_sample(si, light, ω, usable))
+        e2 = dr.square(pdf_of_sample(self.scene, si, light, ω, usable))
         b2 = dr.square(bsdf.pdf(mi.BSDFContext(), si, si.to_local(ω), usable))
         usable &= b2 + e2 > 0
         return dr.select(usable, (b2 + ρ * e2) / dr.select(usable, b2 + e2, 1), 1), ρ
 
-    def pdf_of_sample(self, it: mi.Interaction3f, light, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """p_e of the point `light` as Mitsuba has it, attached but for the area of the light."""
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.p, ds.n, ds.uv, ds.d = light.p, light.sh_frame.n, light.uv, ω
-        ds.dist = dr.select(active, dr.norm(light.p - it.p), 1)
-        ds.emitter = light.emitter(self.scene, active)
-        return self.scene.pdf_emitter_direction(it, ds, active)
+
+def pdf_of_sample(scene: mi.Scene, it: mi.Interaction3f, light, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    """p_e of the point `light` as Mitsuba has it, attached but for the area of the light."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.uv, ds.d = light.p, light.sh_frame.n, light.uv, ω
+    ds.dist = dr.select(active, dr.norm(light.p - it.p), 1)
+    ds.emitter = light.emitter(scene, active)
+    return scene.pdf_emitter_direction(it, ds, active)

@@ -62,8 +62,9 @@ def term_names() -> list[str]:
 def test_gradient_check_passes(capsys):
     brighter = ["--wrt", "card.emitter.radiance.value"]  # known precisely after few seeds
     assert main(["gradient", CARD, *brighter, "--check", "--check-seconds", "30", "--quiet"]) == 0
+    assert main(["gradient", CARD, *brighter, "--check", "--check-step", "0.02", "--quiet"]) == 0
     out = capsys.readouterr().out
-    assert "PASS" in out and "terms in the estimate: interior" in out
+    assert "PASS" in out and "terms in the estimate: interior" in out and "eps 0.02" in out
 
 
 @pytest.mark.slow
@@ -142,6 +143,7 @@ def test_scene_without_sensor(capsys):
     ([*MOVE, "--rotate", "0,1,0"], "not allowed with"),
     ([*MOVE, "--spp", "0"], "--spp must be greater than 0"),
     ([*MOVE, "--seeds", "-1"], "--seeds must be greater than 0"),
+    ([*MOVE, "--check-step", "0"], "--check-step must be greater than 0"),
     ([*MOVE, "--sensor", "3"], "no sensor 3"),
     ([*MOVE, "--variant", "nope"], "no variant 'nope'"),
     ([*MOVE, "--integrator", "nope"], "integrator 'nope'"),
