@@ -36,6 +36,7 @@ from ..edges.kind import Use
 from ..edges.location import EdgeLocation
 from ..edges.points import LEAST_SLANT, start_height
 from ..options import Options
+from ..paths.smooth_lights import has_smooth_lights
 from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
 from ..plan.motion import Displacements
@@ -183,15 +184,9 @@ def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> Bound
     value, still = segment.value / segment.pdf, mi.Vector3f(0)
     receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, value, a, still)
     records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_from_light(job))
-    return BoundarySamples(
-        at=segment.at,
-        ω=segment.ω,
-        n_perp=segment.n_perp,
-        wavelengths=segment.wavelengths,
-        records=records,
-        value=records.left_by_smooth_lobes(records.data.W),
-        source_motion=lambda moving: source_motion(job, segment, moving),
-        drawn=segment.drawn,
+    value = records.left_by_smooth_lobes(records.data.W)
+    return BoundarySamples.of(
+        segment, records, value, lambda moving: source_motion(job, segment, moving), segment.drawn
     )
 
 
@@ -224,7 +219,7 @@ SHADOWS = SecondaryTerm(
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: shadows, steps of lights, horizons of faces."""
     others = [SHADOWS]
-    if any(shape.smooth and shape.is_emitter for shape in job.facts.shapes):
+    if has_smooth_lights(job.facts):
         others.insert(0, LIGHT_HORIZONS)
     if job.facts.has_light_steps:
         others.insert(0, LIGHT_STEPS)

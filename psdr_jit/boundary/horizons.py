@@ -190,14 +190,9 @@ def evaluate_lights(job: Job, horizons: SampledHorizons, lit: LitHorizon) -> Bou
     a, still = -(1 - lit.ratio) * lit.n_perp, mi.Vector3f(0)
     receivers = Receivers(lit.lane, lit.receiver, lit.wavelengths, lit.value, a, still)
     records = subpaths(job, Stream.HORIZON_SUBPATH, receivers, longest_from_light(job))
-    return BoundarySamples(
-        at=lit.at,
-        ω=lit.ω,
-        n_perp=lit.n_perp,
-        wavelengths=lit.wavelengths,
-        records=records,
-        value=records.left_by_smooth_lobes(records.data.W),
-        source_motion=lambda moving: -lit.ratio * dr.dot(lit.n_perp, moving.of_surface(lit.source)),
+    value = records.left_by_smooth_lobes(records.data.W)
+    return BoundarySamples.of(
+        lit, records, value, lambda moving: -lit.ratio * dr.dot(lit.n_perp, moving.of_surface(lit.source))
     )
 
 

@@ -36,7 +36,7 @@ from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
 from . import horizons, indirect_material, indirect_orbits, segment_motion
 from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
-from .segment_motion import BoundarySamples, SecondaryTerm
+from .segment_motion import BoundarySamples, SecondaryTerm, source_rests
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
 
 NAME = "indirect"
@@ -58,7 +58,7 @@ def evaluate(job: Job, edges: SecondaryEdges, view: EdgeView) -> BoundarySamples
         wavelengths=view.wavelengths,
         records=records,
         value=value,
-        source_motion=lambda moving: mi.Float(0),
+        source_motion=source_rests,
         drawn=view.drawn,
     )
 

@@ -35,6 +35,7 @@ from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.location import EdgeLocation
 from ..paths.smooth_lights import pdf_of_sample
+from ..paths.walk import mis_weight
 from ..plan.job import Job
 from ..sampling.horizons import SampledHorizons
 from ..sampling.light_horizons import sampled_light_horizons
@@ -96,25 +97,16 @@ def _weighed_cosine(job: Job, ray: mi.Ray3f, pi, light: mi.SurfaceInteraction3f,
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
     si.wi = si.to_local(dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(si.p)))
-    e2 = dr.square(pdf_of_sample(job.scene, si, light, -ray.d, active))
-    b2 = dr.square(si.bsdf().pdf(mi.BSDFContext(), si, si.to_local(-ray.d), active))
-    w = dr.select(e2 > 0, e2 / (b2 + e2), 0)
-    return dr.abs_dot(light.sh_frame.n, ray.d) * dr.select(dr.isfinite(w), w, 0)
+    p_e = pdf_of_sample(job.scene, si, light, -ray.d, active)
+    p_b = si.bsdf().pdf(mi.BSDFContext(), si, si.to_local(-ray.d), active)
+    return dr.abs_dot(light.sh_frame.n, ray.d) * mis_weight(p_e, p_b)
 
 
 def evaluate(job: Job, horizons: SampledHorizons, lit: LitPlane) -> BoundarySamples:
     """What they are worth at the sensor: their subpaths are recorded."""
     receivers = Receivers(lit.lane, lit.receiver, lit.wavelengths, lit.value, -lit.n_perp, mi.Vector3f(0))
     records = subpaths(job, Stream.LIGHT_HORIZON_SUBPATH, receivers, longest_from_light(job))
-    return BoundarySamples(
-        at=lit.at,
-        ω=lit.ω,
-        n_perp=lit.n_perp,
-        wavelengths=lit.wavelengths,
-        records=records,
-        value=records.left_by_smooth_lobes(records.data.W),
-        source_motion=lambda moving: mi.Float(0),
-    )
+    return BoundarySamples.of(lit, records, records.left_by_smooth_lobes(records.data.W))
 
 
 #: Planes of the faces of lights.

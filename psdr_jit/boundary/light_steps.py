@@ -95,14 +95,14 @@ def trace(job: Job, steps: SampledSteps, line: StepLine) -> StepOnReceiver | Non
 def evaluate(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySamples:
     """What they are worth at the sensor: their subpaths are recorded."""
     records = _subpaths(job, found, longest_from_light(job))
-    return _samples(found, records, records.left_by_smooth_lobes(records.data.W))
+    return BoundarySamples.of(found, records, records.left_by_smooth_lobes(records.data.W))
 
 
 def evaluate_borne(job: Job, steps: SampledSteps, found: StepOnReceiver) -> BoundarySamples:
     """The same of light that x_D sends on by a delta lobe."""
     # in the material form all of the motion is left with x_D
     records = _subpaths(replace(job, plan=replace(job.plan, form="material")), found, _longest_borne(job))
-    return _samples(found, records, dr.select(records.by_delta_lobe(), records.data.W, 0))
+    return BoundarySamples.of(found, records, dr.select(records.by_delta_lobe(), records.data.W, 0))
 
 
 def _longest_borne(job: Job) -> int:
@@ -113,18 +113,6 @@ def _subpaths(job: Job, found: StepOnReceiver, longest: int) -> SubpathRecords:
     value, still = found.value / found.pdf, mi.Vector3f(0)
     receivers = Receivers(found.lane, found.receiver, found.wavelengths, value, -found.n_perp, still)
     return subpaths(job, Stream.LIGHT_STEP_SUBPATH, receivers, longest)
-
-
-def _samples(found: StepOnReceiver, records: SubpathRecords, value: mi.Spectrum) -> BoundarySamples:
-    return BoundarySamples(
-        at=found.at,
-        ω=found.ω,
-        n_perp=found.n_perp,
-        wavelengths=found.wavelengths,
-        records=records,
-        value=value,
-        source_motion=lambda moving: mi.Float(0),
-    )
 
 
 ESTIMATOR = SecondaryTerm(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +33,20 @@ L = TypeVar("L")
 S = TypeVar("S")
 
 
+class Segment(Protocol):
+    """What segments towards lights have in common, whatever brings the step. Lanes."""
+
+    at: EdgeLocation
+    ω: mi.Vector3f
+    n_perp: mi.Vector3f
+    wavelengths: mi.Color0f
+
+
+def source_rests(moving: Displacements) -> mi.Float:
+    """The `source_motion` of segments whose far end does not matter."""
+    return mi.Float(0)
+
+
 @dataclass(frozen=True)
 class BoundarySamples:
     """Boundary segments with their sensor subpaths. Lanes: segments; flat: vertex-major connections."""
@@ -45,6 +59,18 @@ class BoundarySamples:
     value: mi.Spectrum  # flat: splatted per unit of motion
     source_motion: Callable[[Displacements], mi.Float]  # attached, per lane, primal value 0
     drawn: Drawn | None = None  # how the lines were chosen, if they can be guided
+
+    @staticmethod
+    def of(
+        segment: Segment,
+        records: SubpathRecords,
+        value: mi.Spectrum,
+        source_motion: Callable[[Displacements], mi.Float] = source_rests,
+        drawn: Drawn | None = None,
+    ) -> BoundarySamples:
+        return BoundarySamples(
+            segment.at, segment.ω, segment.n_perp, segment.wavelengths, records, value, source_motion, drawn
+        )
 
 
 @dataclass(frozen=True)

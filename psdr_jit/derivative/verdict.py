@@ -51,7 +51,7 @@ def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *,
 
 
 #: What helps where noise decides.
-MORE = "allow more seconds, or take fewer pixels"
+MORE = "allow more seconds, or take fewer pixels or samples a seed"
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,7 @@ def _decide(slope: Gain, test: BlockTest, images: tuple[GroupedImages, ...], blo
     """`(decision, reason)`; `images`: the estimate and two halves of finite differences."""
     seeds = min(group.total for group in images)
     if seeds < MIN_SEEDS:
-        return INCONCLUSIVE, (f"fewer than {MIN_SEEDS} seeds of the estimate or of differences: allow more seconds, "
-                              "or take fewer samples or pixels")
+        return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds of the estimate or of differences: {MORE}"
     if rule.zero_bound is not None:
         return _judge_zero(*images, block, rule.zero_bound)
     if slope.power == 0 and not images[0].mean().any():

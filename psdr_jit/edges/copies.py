@@ -25,6 +25,7 @@ from ..core.compat import (
 from ..errors import UnsupportedError
 from ..scene.capabilities import COPIES
 from ..scene.graph import named_children, stretches
+from ..scene.poses import on_host
 
 #: Attributes of meshes, by the first part of their names.
 ATTRIBUTES = ("vertex_", "face_")
@@ -50,10 +51,6 @@ def _textures(shape: mi.Shape) -> dict[str, mi.Texture]:
     return {name: node for name, node in named_children(shape) if isinstance(node, mi.Texture)}
 
 
-def _matrix(to_world) -> np.ndarray:
-    return np.array(dr.detach(to_world.matrix), float).reshape(4, 4)
-
-
 def _volume(matrix: np.ndarray) -> float:
     """By how much the map scales volumes; negative if it mirrors."""
     return float(np.linalg.det(matrix[:3, :3]))
@@ -74,7 +71,7 @@ def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
     for key, texture in _textures(child).items():
         copy.add_texture_attribute(key, texture)
     copy.set_id(name)
-    params, volume = mi.traverse(copy), _volume(_matrix(to_world))
+    params, volume = mi.traverse(copy), _volume(on_host(to_world))
     params[VERTEX_POSITIONS] = pack_positions(to_world @ dr.detach(mesh_positions(child)))
     faces = mesh_faces(child)
     params[FACES] = dr.ravel(faces if volume > 0 else mi.Vector3u(faces.x, faces.z, faces.y))
@@ -88,8 +85,8 @@ def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
 
 
 def _analytic(child: mi.Shape, plugin: str, to_world, name: str) -> mi.Shape:
-    own = _matrix(mi.traverse(child)["to_world"])
-    matrix = _matrix(to_world) @ own
+    own = on_host(mi.traverse(child)["to_world"])
+    matrix = on_host(to_world) @ own
     if stretches(matrix, plugin):
         raise UnsupportedError(
             f"'{name}': the instance stretches or shears a {plugin}, whose outline is not modelled then; scale it "

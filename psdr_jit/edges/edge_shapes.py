@@ -19,6 +19,7 @@ from ..scene.capabilities import COPIES
 from ..scene.facts import ShapeFacts
 from ..scene.instances import group_of, shape_groups
 from ..scene.names import traverse
+from ..scene.poses import on_host
 from .copies import attributes, copied
 
 
@@ -54,7 +55,7 @@ class GridPlace:
         matrix = np.eye(4)
         for shape in (self.instance, self.shape):
             if shape is not None:
-                matrix = matrix @ np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
+                matrix = matrix @ on_host(mi.traverse(shape)["to_world"])
         return matrix
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, positions_buffer
+from ..scene.poses import on_host
 from .intersections import TriangleMesh
 from .overlaps import box_of
 from .parts import Part
@@ -73,7 +74,7 @@ def state_of(item: Solid | Ball | Drum) -> State:
 
 
 def _matrix(shape: mi.Shape) -> np.ndarray:
-    return np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), dtype=float).reshape(4, 4)
+    return on_host(mi.traverse(shape)["to_world"])
 
 
 def triangles(solid: Solid) -> TriangleMesh:

@@ -10,6 +10,7 @@ from ..core.compat import CONTROL_POINTS, mesh_faces, mesh_positions
 from ..core.ellipsoid import Ellipsoid
 from ..core.tube_axis import Axis
 from ..scene.capabilities import CURVE_SHAPES, ELLIPSOID_SHAPES, GRID_SHAPES
+from ..scene.poses import on_host
 from .grid_triangles import grid_triangles
 from .intersections import cross, tolerance
 
@@ -43,7 +44,7 @@ def _triangles(shape: mi.Shape, plugin: str, outward: float) -> np.ndarray:
         return _quads(_ellipsoids(shape, outward))
     if plugin in CURVE_SHAPES:
         return _quads(_tube(shape, outward) if plugin == "bsplinecurve" else _rods(shape, outward))
-    to_world = np.array(dr.detach(mi.traverse(shape)["to_world"].matrix), float).reshape(4, 4)
+    to_world = on_host(mi.traverse(shape)["to_world"])
     turn = 2 * np.pi * np.arange(CORNERS + 1) / CORNERS
     circle = outward * np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
     if plugin == "disk":

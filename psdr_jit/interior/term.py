@@ -20,7 +20,7 @@ from ..options import Options
 from ..paths.dry_walk import count_vertices, touches
 from ..paths.recording import PathRecords
 from ..paths.scattering import UNIFORM_SHARE
-from ..paths.smooth_lights import SmoothLights
+from ..paths.smooth_lights import SmoothLights, has_smooth_lights
 from ..paths.walk import PathLimits, first_hit, walk
 from ..plan.job import Job
 from ..plan.plan import Geometry
@@ -133,8 +133,7 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
 def flow_of(job: Job) -> Flow:
     """How vertices move. Unless geometry, a light's pose or the camera depend on θ, they do not."""
     facts = job.facts
-    has_smooth_lights = any(s.is_emitter and s.smooth for s in facts.shapes)
-    smooth_lights = SmoothLights(job.scene, alone=job.light is None) if has_smooth_lights else None
+    smooth_lights = SmoothLights(job.scene, alone=job.light is None) if has_smooth_lights(facts) else None
     # a probe moves everything
     lights_rest = job.plan.prunes and job.learns and not (facts.emitters_move or _area_lights_change(facts))
     traits = SceneTraits(

@@ -24,7 +24,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.facts import SceneFacts
 from .edge_on import GRAZING_FLAT
+
+
+def has_smooth_lights(facts: SceneFacts) -> bool:
+    """Is some area light a mesh with interpolated normals?"""
+    return any(shape.is_emitter and shape.smooth for shape in facts.shapes)
 
 
 @dataclass(frozen=True)

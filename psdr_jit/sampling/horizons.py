@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
@@ -26,7 +28,7 @@ MOST_LIGHTS = 16
 #: one whose normals seem to turn away from a light.
 LEAST = 0.1
 
-#: Of one render call: the horizons by term, in a list so that none can be told from not asked for.
+#: Of one render call: the horizons by term or kind, in a list so that none can be told from not asked for.
 TABLES: Slot[dict[str, list[Horizons | None]]] = Slot(dict)
 
 
@@ -39,19 +41,33 @@ class SampledHorizons(SampledRows):
 def sampled_horizons(job: Job, term: str, direct: bool) -> SampledHorizons | None:
     """Horizons before lights (`direct`), or before whatever reflects light; None without any that moves."""
     table = horizons(job, term, direct)
-    if table is None:
-        return None
-    state = row_state(job, f"{term}/horizons", lambda: horizon_weights(job, term, direct))
+    return sampled(job, f"{term}/horizons", table, lambda: horizon_weights(job, term, direct))
+
+
+def sampled(
+    job: Job, what: str, table: Horizons | None, weights: Callable[[], list[mi.Float]]
+) -> SampledHorizons | None:
+    """`table` and how its rows are drawn; None where there is none, or nothing in it counts."""
+    state = None if table is None else row_state(job, what, weights)
     return None if state is None else SampledHorizons(table, job.call.memory[ROW_SAMPLER], state)
 
 
 def horizons(job: Job, term: str, direct: bool) -> Horizons | None:
-    """Built once per render call."""
-    known = job.shared[TABLES].setdefault(term, [])
-    if not known:
+    """The horizons before lights, or before whatever reflects light."""
+
+    def make() -> Horizons | None:
         faces = _faces(job)
         targets = None if faces is None else (_lights(job) if direct else all_around())
-        known.append(None if targets is None else Horizons(faces, targets))
+        return None if targets is None else Horizons(faces, targets)
+
+    return built_once(job, term, make)
+
+
+def built_once(job: Job, which: str, make: Callable[[], Horizons | None]) -> Horizons | None:
+    """What `make()` returned when this render call first asked for it."""
+    known = job.shared[TABLES].setdefault(which, [])
+    if not known:
+        known.append(make())
     return known[0]
 
 

@@ -5,28 +5,22 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.memory import Slot
 from ..edges.coarse import bends
 from ..edges.horizons import Horizons
 from ..plan.job import Job
-from .horizons import SampledHorizons, all_around, flags, smooth_faces, spread
-from .rows import ROW_SAMPLER, row_state
+from .horizons import SampledHorizons, all_around, built_once, flags, sampled, smooth_faces, spread
 
-#: Of one render call: the table, in a list so that none can be told from not asked for.
-TABLE: Slot[list[Horizons | None]] = Slot(list)
+#: What tables and samplers know them by.
+WHICH = "direct/light_horizons"
 
 #: Angle between a shading normal and its face [degrees] from which what a light sends along its faces is worth samples.
-#: A ball of 64 segments has 2.8, and without it 1 to 2 % too little.
+#: A ball of 64 segments has 2.8.
 LEAST_BEND = 0.5
 
 
 def sampled_light_horizons(job: Job) -> SampledHorizons | None:
     """The planes of the faces of smooth-shaded lights; None without any."""
-    table = _table(job)
-    if table is None:
-        return None
-    state = row_state(job, "direct/light_horizons", lambda: light_horizon_weights(job))
-    return None if state is None else SampledHorizons(table, job.call.memory[ROW_SAMPLER], state)
+    return sampled(job, WHICH, _table(job), lambda: light_horizon_weights(job))
 
 
 def light_horizon_weights(job: Job) -> list[mi.Float]:
@@ -41,11 +35,7 @@ def light_horizon_weights(job: Job) -> list[mi.Float]:
 
 
 def _table(job: Job) -> Horizons | None:
-    """Built once per render call."""
-    known = job.shared[TABLE]
-    if not known:
-        known.append(Horizons(smooth_faces(job), all_around()) if any(_glow(job)) else None)
-    return known[0]
+    return built_once(job, WHICH, lambda: Horizons(smooth_faces(job), all_around()) if any(_glow(job)) else None)
 
 
 def _glow(job: Job) -> list[bool]:

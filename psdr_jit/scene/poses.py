@@ -7,8 +7,14 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.joining import joined
+
+
+def on_host(to_world) -> np.ndarray:
+    """The matrix (4, 4) of a transform, detached, in double precision."""
+    return np.array(dr.detach(to_world.matrix), dtype=float).reshape(4, 4)
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,13 @@ def of_child(environment: Mapping[str, str]) -> dict[str, str]:
     """`environment` for a child process that compiles quickly, unless it says otherwise itself."""
     child = {VARIABLE: "1", **environment}
     if is_asked(child):
-        child.setdefault(CACHE_VARIABLE, str(Path.home() / CACHE_FOLDER))
+        child.setdefault(CACHE_VARIABLE, own_cache())
     return child
+
+
+def own_cache() -> str:
+    """The folder for kernels made in this way."""
+    return str(Path.home() / CACHE_FOLDER)
 
 
 def apply_if_asked() -> None:
@@ -47,19 +52,18 @@ def apply_if_asked() -> None:
     """
     if not is_asked(os.environ):
         return
-    problem = keep_kernels_apart() or set_options(os.environ.get(llvm.VARIABLE))
+    problem = mixed_kernels() or set_options(os.environ.get(llvm.VARIABLE))
     if problem is not None:
         warnings.warn(f"{VARIABLE} has no effect: {problem}", stacklevel=3)
+    elif not os.environ.get(CACHE_VARIABLE):
+        os.environ[CACHE_VARIABLE] = own_cache()
 
 
-def keep_kernels_apart() -> str | None:
-    """Give this process a kernel cache of its own; returns why that is not possible, or None."""
-    if os.environ.get(CACHE_VARIABLE):
+def mixed_kernels() -> str | None:
+    """Why this process cannot have a kernel cache of its own, or None."""
+    if os.environ.get(CACHE_VARIABLE) or "drjit" not in sys.modules:
         return None
-    if "drjit" in sys.modules:
-        return f"drjit was imported before psdr_jit; import psdr_jit first, or set {CACHE_VARIABLE} as well"
-    os.environ[CACHE_VARIABLE] = str(Path.home() / CACHE_FOLDER)
-    return None
+    return f"drjit was imported before psdr_jit; import psdr_jit first, or set {CACHE_VARIABLE} as well"
 
 
 def set_options(library: str | None) -> str | None:
@@ -68,9 +72,8 @@ def set_options(library: str | None) -> str | None:
         return "no LLVM was chosen; run: psdr doctor"
     try:
         loaded = ctypes.CDLL(library)
-        major = ctypes.c_uint()
-        loaded.LLVMGetVersion(ctypes.byref(major), None, None)
-    except (OSError, AttributeError) as error:  # AttributeError: the function came with LLVM 16
+        loaded.LLVMGetVersion  # noqa: B018  came with LLVM 16
+    except (OSError, AttributeError) as error:
         return f"{library} is no LLVM of version {OLDEST_MAJOR} or newer ({error})"
     words = [word.encode() for word in ("psdr", *LLVM_OPTIONS)]
     loaded.LLVMParseCommandLineOptions(len(words), (ctypes.c_char_p * len(words))(*words), None)
