@@ -34,7 +34,7 @@ from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
 from ..scene.painted_lights import warn_about_painted_lights
-from ..scene.stale_normals import warn_about_stale_normals
+from ..scene.stale_values import warn_about_stale_values
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
 from .noise_log import NoiseLog
@@ -117,7 +117,7 @@ def prepare(call: Call) -> Prepared:
     if call.options.hide_emitters:
         warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":
-        warn_about_stale_normals(call.scene, facts, call.memory)
+        warn_about_stale_values(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())
     plan, log = _plan(question) if given is None else (_as_given(given, question), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)

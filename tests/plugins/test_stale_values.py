@@ -81,3 +81,34 @@ def test_loops_that_assign_or_isolate_are_not_told():
             backward(scene, params, method, seed)
     variable = psdr_jit.Vertices(BALL, learning_rate=1e-3, smoothness=0)
     psdr_jit.optimize(scene, variable, np.zeros((8, 8, 3)), iterations=2, spp=2, integrator=method)
+
+
+def field_of_view(updated: bool, seed: int = 0) -> float:
+    scene = scene_io.load_scene(scene_io.shipped_scene("cbox.xml"), res=8)
+    params = mi.traverse(scene)
+    dr.enable_grad(params["sensor.x_fov"])
+    if updated:
+        params.update()
+    dr.backward(dr.mean(mi.render(scene, params, integrator=integrator(), spp=4, seed=seed), axis=None))
+    return float(dr.grad(params["sensor.x_fov"])[0])
+
+
+def test_a_field_of_view_that_was_not_updated_is_told():
+    with pytest.warns(UnsupportedWarning, match=r"does not depend on 'sensor\.x_fov'.*params\.update"):
+        assert field_of_view(updated=False) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UnsupportedWarning)
+        assert field_of_view(updated=True) != 0
+
+
+@pytest.mark.filterwarnings("error::psdr_jit.errors.UnsupportedWarning")
+@pytest.mark.parametrize("key", ["floor.to_world", "sensor.to_world"])
+def test_poses_that_are_assigned_or_read_as_they_are_are_not_told(key: str):
+    scene = scene_io.load_scene(scene_io.shipped_scene("cbox.xml"), res=8)
+    params = mi.traverse(scene)
+    shift = mi.Float(0)
+    dr.enable_grad(shift)
+    params[key] = mi.Transform4f().translate([shift, 0, 0]) @ mi.Transform4f(params[key])
+    params.update()
+    dr.backward(dr.mean(mi.render(scene, params, integrator=integrator(), spp=4), axis=None))
+    assert dr.grad(shift)[0] != 0
