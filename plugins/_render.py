@@ -16,7 +16,7 @@ from psdr_jit.driver.prepare import Prepared, prepare
 from psdr_jit.driver.primal import image_plugin
 from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import ParameterError, PsdrError
-from psdr_jit.options import Options
+from psdr_jit.options import Options, require_known
 from psdr_jit.plan.call import Call
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.batch_sensor import is_uniform, parts_of, share, side_by_side, splits
@@ -134,7 +134,9 @@ def register(name: str, integrator: type[TermIntegrator]) -> None:
     def make(props: mi.Properties) -> TermIntegrator:
         """Mitsuba prints all frames that an error has passed through: as few as possible."""
         try:
-            return integrator(props)
+            made = integrator(props)
+            require_known(props)
+            return made
         except PsdrError as error:
             raise error.with_traceback(None) from None
 

@@ -6,6 +6,9 @@ only knows Python's own hierarchy still catches what it expects.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class PsdrError(Exception):
     """Root of all errors raised on purpose by psdr_jit."""
@@ -61,3 +64,9 @@ class StalledWarning(UserWarning):
 
 class ClusterError(PsdrError, RuntimeError):
     """Other processes or machines cannot do their part: they are gone, full, or have other packages."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'near'?"` with the name in `known` that is nearest to `name`, or nothing if none is near."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""

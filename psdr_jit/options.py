@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from numbers import Integral
 
-from .errors import OptionError
+from .errors import OptionError, did_you_mean
 
 #: `max_depth = -1` in a scene file: unlimited. Mitsuba's own encoding.
 UNLIMITED = 0xFFFFFFFF
@@ -135,6 +135,14 @@ def _properties() -> list[tuple[str, object]]:
     """`(name, default)` of the fields that are properties of every integrator."""
     special = ("more_budgets", "light_paths")
     return [(field.name, field.default) for field in fields(Options) if field.name not in special]
+
+
+def require_known(props) -> None:
+    """Raise `OptionError` unless the integrator has read every one of its Mitsuba `Properties`."""
+    known = [name for name, _ in _properties()] + ["light_paths"]
+    unknown = [f"property '{name}'{did_you_mean(name, known)}" for name in props.unqueried()]
+    if unknown:
+        raise OptionError(f"{props.plugin_name()} has no {'; no '.join(unknown)}")
 
 
 def require_count(name: str, value, hint: str = "") -> None:

@@ -104,7 +104,10 @@ def outputs(args: argparse.Namespace) -> tuple[Path, Path]:
 
 def describe(result: Any, exr: Path, png: Path) -> str:
     """What was computed, in a few lines."""
-    return f"{result}\nwrote {exr} and {png}"
+    alone = "" if result.terms else (
+        "\n  by automatic differentiation alone: what moving edges and shadows bring is missing"
+    )
+    return f"{result}{alone}\nwrote {exr} and {png}"
 
 
 def check(args: argparse.Namespace, scene: Any, parameter: Any, spec: dict[str, Any], who: dict[str, Any]) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 
 from psdr_jit.cli import common
+from psdr_jit.errors import OptionError
 
 NAME = "plan"
 HELP = "show what differentiating a scene would compute, and why"
@@ -27,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table; 0."""
     common.require_positive(spp=args.spp, max_depth=args.max_depth)
+    if not args.wrt:
+        raise OptionError(f"--wrt PARAM is missing: nothing is differentiated; 'psdr params {args.scene}' lists what "
+                          "can be")  # fmt: skip
     from psdr_jit.derivative.make_plan import make_plan
     from psdr_jit.scene import io as scene_io
 

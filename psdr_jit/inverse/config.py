@@ -39,7 +39,6 @@ render = 256
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
@@ -47,7 +46,7 @@ from typing import Any
 
 from psdr_jit.cluster.source import SceneFile
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.errors import OptionError
+from psdr_jit.errors import OptionError, did_you_mean
 from psdr_jit.inverse.losses import LOSSES
 from psdr_jit.inverse.parts import Stage
 from psdr_jit.inverse.problem import Problem, make_problem
@@ -167,8 +166,7 @@ def _tables(content: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
 def _unknown(where: str, table: Mapping[str, Any], known: list[str], wrong: list[str]) -> None:
     for key in table:
         if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            wrong.append(f"{where}there is no key '{key}'{f'; did you mean {close[0]!r}?' if close else ''}")
+            wrong.append(f"{where}there is no key '{key}'{did_you_mean(key, known)}")
 
 
 def _scene(path: Path, k: int, table: Mapping[str, Any], wrong: list[str]) -> SceneTable:

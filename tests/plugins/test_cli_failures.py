@@ -144,3 +144,15 @@ def test_results_print_one_line_a_term():
     assert len(lines) == 3 + len(result.terms) and max(map(len, lines)) < 120
     assert "array" not in repr(result) and all(any(line.split()[0] == t for line in lines) for t in result.terms)
     assert "array" not in repr(psdr_jit.check_gradient(card(), *MOVE, spp=1, max_seconds=0.01))
+
+
+def test_a_plan_of_nothing_asks_for_a_parameter(capsys):
+    status, line = said_by(capsys, "plan", CARD)
+    assert status == 2 and "--wrt" in line and f"psdr params {CARD}" in line
+
+
+def test_integrators_that_see_no_edges_are_said_to(capsys):
+    loud = [word for word in GRADIENT if word != "--quiet"] + ["--spp", "4", "--seeds", "2"]
+    for name, told in (("prb", True), ("psdr_path", False)):
+        assert main([*loud, "--integrator", name]) == 0
+        assert ("edges and shadows bring is missing" in capsys.readouterr().out) == told

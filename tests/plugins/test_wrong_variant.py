@@ -95,5 +95,14 @@ def test_a_wrong_property_is_named_without_our_own_frames():
     lines = str(caught.value).splitlines()
     assert lines[-1].startswith("OptionError: max_depth = 'x' is of type str")
     assert sum("_render.py" in line for line in lines) == 1 and not any("options.py" in line for line in lines)
-    with pytest.raises(OptionError, match="integrator 'psdr_path' cannot be made: it has no property 'bogus'"):
-        psdr_jit.gradient(load(), BOX, (1, 0, 0), integrator={"type": "psdr_path", "bogus": 1})
+    with pytest.raises(OptionError, match="integrator 'prb' cannot be made: it has no property 'bogus'"):
+        psdr_jit.gradient(load(), BOX, (1, 0, 0), integrator={"type": "prb", "bogus": 1})
+
+
+@pytest.mark.parametrize("wrong, near", [("max_dept", "'max_depth'"), ("gide", "'guide'"), ("xyz", None)])
+def test_a_misspelt_property_is_told_what_it_may_have_meant(wrong, near):
+    words = f"psdr_path has no property '{wrong}'" + (f"; did you mean {near}" if near else "$")
+    with pytest.raises(OptionError, match=words):
+        psdr_jit.gradient(load(), BOX, (1, 0, 0), integrator={"type": "psdr_path", wrong: 1})
+    with pytest.raises(RuntimeError, match=words):
+        mi.load_dict({"type": "psdr_path", wrong: 1})
