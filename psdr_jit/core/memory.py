@@ -57,6 +57,18 @@ def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:
     return [a.index for a in kept] == [a.index for a in arrays]
 
 
+def same_contents(kept: list[Any], arrays: list[Any]) -> bool:
+    """Do these flat JIT arrays, one by one, hold what the kept ones do? At once where they are those that were kept.
+
+    For what takes longer to make than to compare: parameters that are assigned anew in every call, to attach them,
+    are other arrays of the same content.
+    """
+    if [dr.width(a) for a in kept] != [dr.width(b) for b in arrays]:
+        return False
+    changed = [(a, b) for a, b in zip(kept, arrays, strict=True) if a.index != b.index]
+    return all(bool(dr.all(a == b)[0]) for a, b in changed)
+
+
 def while_unchanged(kept: dict[K, tuple[list[Any], T]], key: K, arrays: list[Any], make: Callable[[], T]) -> T:
     """What `make()` returned for `key`, made anew once one of the arrays it is made from has been replaced."""
     arrays = [dr.detach(array) for array in arrays]

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import mesh_buffers
-from ..core.memory import Slot, same_arrays
+from ..core.memory import Slot, same_contents
 from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
 from ..core.varying import varying
@@ -135,7 +135,7 @@ def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball | Drum, ...]
     buffers = [dr.detach(buffer) for shape in shapes for buffer in mesh_buffers(shape)]
     buffers += [on_sides for on_sides in seams if on_sides is not None]
     known = job.call.memory[STRAIGHT]
-    if known is None or known[1] != (moving, painted) or not same_arrays(known[0], buffers):
+    if known is None or known[1] != (moving, painted) or not same_contents(known[0], buffers):
         straight = edge_set(shapes, moving, job.call.memory, seams=seams, painted=painted)
         known = (buffers, (moving, painted), straight)
         job.call.memory[STRAIGHT] = known
