@@ -37,7 +37,7 @@ class PathSpaceIntegrator(TermIntegrator):
        - Samples per pixel of the secondary boundary terms; `sppd` overrides `sppi` for the direct one
      * - record_mib
        - |int|
-       - Memory for recorded paths in MiB; larger wavefronts run in several passes (Default: 1024)
+       - Memory for recorded paths in MiB; larger wavefronts run in several passes (Default: 512)
      * - form
        - |string|
        - What path vertices do while a parameter changes: `spatial` (slide along their rays), `material` (stay on their

@@ -49,7 +49,7 @@ class Options:
     spps: int | None = None  # lines per pixel, boundary seen through mirrors and glass; overrides sppp
     sppi: int | None = None  # samples per pixel, default of each secondary boundary term
     sppd: int | None = None  # samples per pixel, direct boundary term; overrides sppi
-    record_mib: int = 1024  # memory for recorded paths; larger wavefronts are split into passes
+    record_mib: int = 512  # memory for recorded paths; larger wavefronts are split into passes
     form: str = "auto"  # one of FORMS, or "auto": whichever suits the scene
     plan: str = "lean"  # one of PLANS, or a plan that was made before, as JSON
     direction: str = "any"  # one of DIRECTIONS

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -154,7 +155,8 @@ def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterat
     """Split a job so that one part's samples fit into `record_mib`: `(share of the samples, part)`.
 
     `pixels`: samples per spp, by default those of the crop window. Parts have seeds of their own; the split depends on
-    host data only, so forward and backward mode agree on it.
+    host data only, so forward and backward mode agree on it. Where there are several, Dr.Jit's cache of freed arrays is
+    emptied after the last one: the next term has arrays of other sizes, and would need as much once more.
     """
     if pixels is None:
         pixels = int(job.film.crop_size()[0]) * int(job.film.crop_size()[1])
@@ -166,3 +168,5 @@ def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterat
         seed = job.seed if done == 0 else mi.sample_tea_32(mi.UInt32(job.seed), mi.UInt32(done))[0]
         yield spp / job.spp, replace(job, call=replace(job.call, seed=seed), spp=spp)
         done += spp
+    if done > per_pass:
+        dr.flush_malloc_cache()
