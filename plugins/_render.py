@@ -22,6 +22,7 @@ from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.batch_sensor import is_uniform, parts_of, share, side_by_side, splits
 from psdr_jit.scene.guard import require_integrator
 from psdr_jit.scene.io import find_sensor
+from psdr_jit.scene.late_tangents import tangents_arrived
 
 
 class TermIntegrator(ADIntegrator):
@@ -90,9 +91,10 @@ class TermIntegrator(ADIntegrator):
     def _forward(self, call: Call):
         with alone(), leftovers_named():
             prepared = self._prepared(call)
-            images = {term.name: term.forward(job) for term, job in prepared.jobs}
-            prepared.observe(call.seed, images)
-            return self.aovs.forward(call, prepared, sum(images.values(), films.black(call.film)))
+            with tangents_arrived(call.scene, call.sensor, prepared.facts):
+                images = {term.name: term.forward(job) for term, job in prepared.jobs}
+                prepared.observe(call.seed, images)
+                return self.aovs.forward(call, prepared, sum(images.values(), films.black(call.film)))
 
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         require_integrator(self)

@@ -60,6 +60,7 @@ class Prepared:
     """What has to run: the plan, and a job for each of its running terms."""
 
     plan: Plan
+    facts: SceneFacts
     jobs: list[tuple[Term, Job]]
     log: NoiseLog | None  # wants to see the derivative images of forward mode
     plain: Callable[[int], Job]  # the job of what is no term: so many paths per pixel, spread evenly
@@ -127,8 +128,8 @@ def prepare(call: Call) -> Prepared:
     by_name = {term.name: term for term in TERMS}
     listens = log is not None and question.automatic  # in every call: others would need kernels of their own
     tallies = {t.name: log.heard(plan.form, t.name) if listens else None for t in plan.running}
-    return Prepared(plan, [(by_name[t.name], question.job(plan, t.spp, t, tallies[t.name])) for t in plan.running], log,
-                    lambda spp: question.job(plan, spp))  # fmt: skip
+    jobs = [(by_name[t.name], question.job(plan, t.spp, t, tallies[t.name])) for t in plan.running]
+    return Prepared(plan, facts, jobs, log, lambda spp: question.job(plan, spp))
 
 
 def _require_unfrozen() -> None:

@@ -24,7 +24,8 @@ from ..core.compat import (
 )
 from ..errors import UnsupportedError
 from ..scene.capabilities import COPIES
-from ..scene.graph import named_children, stretches
+from ..scene.graph import named_children
+from ..scene.pose_faults import stretches
 from ..scene.poses import on_host
 
 #: Attributes of meshes, by the first part of their names.

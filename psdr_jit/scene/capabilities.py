@@ -125,8 +125,8 @@ SUPPORT = (
         "that shines; glowing meshes of few faces that change in size: up to 1 % off; mirrors, two-sided bodies and, "
         "under point, spot and directional lights, any with normals far off their faces: warning"),
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
-        "stretched or sheared spheres and cylinders, SDF grids that are turned or have unequal numbers of values along "
-        "the axes: error; smooth normals on fewer than 48 values a side: warning"),
+        "stretched or sheared spheres and cylinders, mirrored ones that move, SDF grids that are turned or have "
+        "unequal numbers of values along the axes: error; smooth normals on fewer than 48 values a side: warning"),
     Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
@@ -136,7 +136,8 @@ SUPPORT = (
     Row("batch sensor", "yes", "its sensors are rendered one by one, uncropped; `sample_border` needs equal filters"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes",
-        "warning: paint that shares texture coordinates; lights that `hide_emitters` hides before curved shapes"),
+        "warning: paint that shares texture coordinates; lights that `hide_emitters` hides before curved shapes; maps "
+        "whose pose does more than to turn them"),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),

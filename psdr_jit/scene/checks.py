@@ -133,18 +133,8 @@ def check_shapes(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} has no edge set, so its silhouettes would be missing from the derivative of this "
                 f"geometry; {way_out}, or differentiate materials and radiance only",
             )  # fmt: skip
-        if shape.uneven_scale:
-            yield Finding(
-                SceneError, shape.name,
-                f"{label} is stretched or sheared, which Mitsuba renders as an unstretched one; scale it "
-                "evenly, or use a mesh",
-            )  # fmt: skip
-        if shape.turned_grid:
-            yield Finding(
-                SceneError, shape.name,
-                f"{label} is turned or mirrored by its to_world, which Mitsuba does not support: it shades it as if it "
-                "was not; put it into a shapegroup and turn an instance of it",
-            )  # fmt: skip
+        if shape.pose_fault:
+            yield Finding(SceneError, shape.name, f"{label} {shape.pose_fault}")
 
 
 def check_instances(facts: SceneFacts) -> Iterator[Finding]:
@@ -243,10 +233,12 @@ def _missing_steps(subject: str, label: str, jumps: tuple[str, ...]) -> Finding:
     )  # fmt: skip
 
 
-def check_emitter_steps(facts: SceneFacts) -> Iterator[Finding]:
-    """Lights whose emission ends in a step, or in a slope as good as one, that no edge stands for."""
+def check_emitters(facts: SceneFacts) -> Iterator[Finding]:
+    """Lights whose emission ends in a step, or in a slope as good as one, that no edge stands for; turned skies."""
     for emitter in facts.emitters:
         label = f"emitter '{emitter.name}' ({emitter.plugin})"
+        if emitter.pose_fault:
+            yield Finding(UnsupportedWarning, emitter.name, f"{label} {emitter.pose_fault}")
         if emitter.rim == "thin" and (facts.geometry_moves or CONE_PARAMETERS & set(emitter.radiance)):
             yield Finding(
                 UnsupportedWarning, emitter.name,
@@ -272,5 +264,5 @@ CHECKS = (
     check_delta_weights,
     check_extent,
     check_surface_steps,
-    check_emitter_steps,
+    check_emitters,
 )

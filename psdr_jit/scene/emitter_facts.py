@@ -9,6 +9,7 @@ import mitsuba as mi
 from .capabilities import CONE_PARAMETERS, POSE_PARAMETERS, UNIFORM_EMITTERS
 from .graph import SceneGraph, is_painted, jumping_textures, plugin_name, rim_of_cone
 from .patterns import missing_patterns, steps_of_light
+from .pose_faults import sky_pose_fault
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class EmitterFacts:
     jumps: tuple[str, ...]  # other discontinuous textures, but for those on a shape that are `ShapeFacts.patterns`
     pose: tuple[str, ...]  # enabled parameters that move it, or its steps
     radiance: tuple[str, ...]  # all other enabled parameters
+    pose_fault: str  # why Mitsuba does not show its pose as it says, and the way out; "" if it does
 
 
 def emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: list) -> EmitterFacts:
@@ -50,4 +52,5 @@ def emitter_facts(graph: SceneGraph, emitter: mi.Emitter, index: int, shapes: li
         jumps=missing_patterns(jumps) if steps or (owners and plugin == "area") else jumps,
         pose=pose,
         radiance=tuple(n for n in enabled if n not in pose) + graph.enabled_below(emitter, skip=(mi.Shape,)),
+        pose_fault=sky_pose_fault(graph, emitter, plugin),
     )

@@ -29,8 +29,6 @@ from .graph import (
     is_black,
     is_cubic,
     is_painted,
-    is_turned_grid,
-    is_unevenly_scaled,
     jumping_textures,
     non_finite_vertices,
     plugin_name,
@@ -39,6 +37,7 @@ from .graph import (
 from .guard import require_derivatives
 from .instances import require_codes, shape_groups
 from .patterns import missing_on_curves, missing_patterns
+from .pose_faults import shape_pose_fault
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,7 @@ class ShapeFacts:
     has_texcoords: bool
     is_emitter: bool
     has_medium: bool
-    uneven_scale: bool  # a sphere or cylinder under a transform that Mitsuba does not model
-    turned_grid: bool  # a grid of signed distances under one
+    pose_fault: str  # why Mitsuba does not render its pose as it says, and the way out; "" if it does
     bsdf: str  # plugin, as written in XML
     bsdf_flags: int  # mi.BSDFFlags
     black: bool  # it scatters nothing
@@ -260,8 +258,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         has_texcoords=is_mesh and shape.has_vertex_texcoords(),
         is_emitter=shape.is_emitter(),
         has_medium=shape.is_medium_transition(),
-        uneven_scale=is_unevenly_scaled(graph, shape, plugin),
-        turned_grid=is_turned_grid(graph, shape, plugin),
+        pose_fault=shape_pose_fault(graph, shape, plugin),
         bsdf=plugin_name(bsdf) if bsdf is not None else "none",
         bsdf_flags=bsdf.flags() if bsdf is not None else 0,
         black=is_black(graph, bsdf),

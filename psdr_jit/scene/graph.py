@@ -15,18 +15,13 @@ import numpy as np
 
 from ..core.compat import positions_buffer
 from ..core.joining import joined
-from .capabilities import FRAME_FREE_PLUGINS, GRID_SHAPES, JUMPING_PLUGINS
+from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS
 from .names import plugin_name, traverse
 from .params import parameter_value
 
 HARD_RIM, THIN_RIM = 1e-6, 1e-3
 """A spot's rim, relative to its cone: narrower than the first, by rounding alone, it is a step; narrower than the
 second, few samples meet it."""
-
-UNEVEN_SCALE = 1e-4
-"""Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform."""
-
-
 
 
 class SceneGraph:
@@ -166,7 +161,7 @@ def is_black(graph: SceneGraph, bsdf: mi.BSDF | None) -> bool:
     """
     if bsdf is None or plugin_name(bsdf) != "diffuse" or graph.enabled_from(bsdf):
         return False
-    values = [_host(graph.value(texture, "value")) for texture in child_objects(bsdf)]
+    values = [on_host_or_none(graph.value(texture, "value")) for texture in child_objects(bsdf)]
     return all(value is not None and not value.any() for value in values)
 
 
@@ -207,47 +202,16 @@ def rim_of_cone(graph: SceneGraph, emitter: mi.Emitter) -> str:
 
     "" for other lights, and while a function is being frozen.
     """
-    cutoff, beam = (_host(graph.value(emitter, name)) for name in ("cutoff_angle", "beam_width"))
+    cutoff, beam = (on_host_or_none(graph.value(emitter, name)) for name in ("cutoff_angle", "beam_width"))
     if cutoff is None or beam is None:
         return ""
     width = np.min(cutoff - beam)
     return "hard" if width <= HARD_RIM * cutoff.max() else "thin" if width <= THIN_RIM * cutoff.max() else "soft"
 
 
-def is_unevenly_scaled(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
-    """Whether a sphere is stretched or sheared, or the cross-section of a cylinder is."""
-    if plugin not in ("sphere", "cylinder"):
-        return False
-    matrix = _host(graph.value(shape, "to_world").matrix)
-    return matrix is not None and stretches(matrix.reshape(4, 4), plugin)
-
-
 def is_cubic(graph: SceneGraph, shape: mi.Shape) -> bool:
     """Has a grid as many values along each axis? Mitsuba 3.9 mixes the axes up where it has not."""
     return len(set(graph.value(shape, "grid").shape[:3])) == 1
-
-
-def is_turned_grid(graph: SceneGraph, shape: mi.Shape, plugin: str) -> bool:
-    """Does the pose of a grid of signed distances turn it? Mitsuba 3.9 warns of that, and its normals are wrong."""
-    if plugin not in GRID_SHAPES:
-        return False
-    matrix = _host(graph.value(shape, "to_world").matrix)
-    if matrix is None:
-        return False
-    left, _, right = np.linalg.svd(matrix.reshape(4, 4)[:3, :3])
-    return bool(np.abs(left @ right - np.eye(3)).max() > UNEVEN_SCALE)
-
-
-def stretches(matrix: np.ndarray, plugin: str) -> bool:
-    """Whether this object-to-world map (4, 4) makes an ellipsoid of a sphere, or an ellipse of a cylinder's circle."""
-    if plugin not in ("sphere", "cylinder"):
-        return False
-    axes = matrix[:3, :3]
-    length = np.linalg.norm(axes, axis=0)
-    round_axes = length if plugin == "sphere" else length[:2]
-    gram = (axes / np.maximum(length, np.finfo(np.float32).tiny)).T @ axes / length.max()
-    sheared = np.abs(gram - np.diag(np.diag(gram))).max() > UNEVEN_SCALE
-    return bool(sheared or np.ptp(round_axes) > UNEVEN_SCALE * round_axes.max())
 
 
 def non_finite_vertices(shapes: list[mi.Shape]) -> list[int]:
@@ -265,7 +229,7 @@ def non_finite_vertices(shapes: list[mi.Shape]) -> list[int]:
     return result
 
 
-def _host(value) -> np.ndarray | None:
+def on_host_or_none(value) -> np.ndarray | None:
     """`value` on the host, or None while a function is being frozen: its values are not available then."""
     if value is None or dr.flag(dr.JitFlag.FreezingScope):
         return None
