@@ -13,6 +13,14 @@ from psdr_jit.errors import UnsupportedError
 COMPUTED_OUTSIDE = "outside of the current dr.isolate_grad() scope"
 
 
+def array_of(value):
+    """The value of a scene parameter as a Dr.Jit array: of a transform, its matrix.
+
+    Not by asking for `matrix`: vectors and colours have every attribute whose letters name components, or do not.
+    """
+    return value if dr.is_array_v(value) else value.matrix
+
+
 def tangents(*values):
     """Forward-mode tangents of `values`. Interior nodes keep theirs until all are read: one value may feed another.
 

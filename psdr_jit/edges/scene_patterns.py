@@ -167,14 +167,14 @@ def same_parameters(known: list, values: list) -> bool:
 
 def _identity(value: Any) -> Any:
     """Equal for two values if they are the same object or array; the other one must be alive."""
-    if hasattr(value, "matrix"):
-        return np.array(value.matrix).tobytes()
-    if dr.is_tensor_v(value):
-        return value.array.index
-    if dr.is_array_v(value) and dr.depth_v(value) > 1:
-        return tuple(_identity(component) for component in value)
     if isinstance(value, mi.Object):
         return id(value)
+    if not dr.is_array_v(value):
+        return np.array(value.matrix).tobytes() if hasattr(value, "matrix") else value
+    if dr.is_tensor_v(value):
+        return value.array.index
+    if dr.depth_v(value) > 1:
+        return tuple(_identity(component) for component in value)
     return value.index if dr.is_jit_v(value) else value
 
 

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
+from ..core.ad import array_of
 from ..core.compat import VERTEX_POSITIONS, mesh_buffers
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
@@ -75,8 +76,7 @@ class _Edges:
 
 def _variables(value) -> Iterator[int]:
     """Places in the AD graph of all arrays in a parameter's value."""
-    if not dr.is_array_v(value):
-        value = value.matrix  # of a transform
+    value = array_of(value)
     if dr.is_tensor_v(value):
         value = value.array
     if dr.depth_v(value) > 1:

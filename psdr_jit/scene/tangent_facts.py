@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.ad import tangents
+from ..core.ad import array_of, tangents
 from ..core.compat import VERTEX_NORMALS, mesh_positions
 from ..core.joining import joined
 from .facts import SceneFacts, analyse
@@ -37,7 +37,7 @@ def facts_along_tangents(scene: mi.Scene, sensor: mi.Sensor) -> SceneFacts:
 def has_tangent(value) -> bool:
     """Is the tangent of this parameter value anything but 0?"""
     with dr.resume_grad():
-        grad = dr.grad(value.matrix if hasattr(value, "matrix") else value)
+        grad = dr.grad(array_of(value))
     return bool(np.any(np.array(grad)))
 
 
