@@ -148,7 +148,7 @@ SUPPORT = (
         "before nothing: the image is that of `prb`, `path` drops light there"),
     Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",
         "IOR: `psdr_dielectric`, `psdr_plastic` in place of `dielectric`, `plastic`, which keep it as a plain number; "
-        "behind glass as in the row above; opacity of a mask, what is under it or a bump map, normals: error"),
+        "behind glass as in the row above; opacity of a mask, what is under it or a bump map: error"),
     Row("hair; mirrors and glass under a mask, with bent normals, or blended with smooth materials", "error",
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ..core.compat import VERTEX_NORMALS, VERTEX_TEXCOORDS
+from ..core.compat import VERTEX_TEXCOORDS
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
@@ -145,8 +145,9 @@ def check_instances(facts: SceneFacts) -> Iterator[Finding]:
         what = "an instance" if shape.kind == "instance" else f"a shape of shapegroup '{shape.group}'"
         yield Finding(
             UnsupportedError, shape.name,
-            f"shape '{shape.name}' ({shape.plugin}) is {what} that moves ({', '.join(shape.geometry)}), which is not "
-            f"modelled: instances take part while something else is differentiated; {COPIES}",
+            f"shape '{shape.name}' ({shape.plugin}) is {what} that moves "
+            f"({', '.join(shape.geometry or shape.shading)}), which is not modelled: instances take part while "
+            f"something else is differentiated; {COPIES}",
         )  # fmt: skip
 
 
@@ -177,11 +178,10 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
-    """What delta lobes under others are worth is not known, and directions follow normals where geometry moves only."""
-    for shape in facts.shapes:  # where geometry moves, directions follow the normals
-        watched = () if facts.geometry_moves or not shape.delta_lobes else shape.shading
-        steering = [name for name in watched if name == VERTEX_NORMALS or shape.lost_varies]
-        enabled = list(shape.lost_weights) + [f"{shape.name}.{name}" for name in steering]
+    """What delta lobes under others are worth is not known."""
+    for shape in facts.shapes:
+        watched = shape.shading if shape.delta_lobes and shape.lost_varies and not facts.geometry_moves else ()
+        enabled = list(shape.lost_weights) + [f"{shape.name}.{name}" for name in watched]
         if enabled:
             yield Finding(
                 UnsupportedError, shape.name,

@@ -76,7 +76,8 @@ class ShapeFacts:
 
     @property
     def moves(self) -> bool:
-        return bool(self.geometry)
+        """Something of it slides that edges stand for: its surface, or where its normals turn from the viewer."""
+        return bool(self.geometry) or (self.smooth and VERTEX_NORMALS in self.shading)
 
     @property
     def opaque(self) -> bool:

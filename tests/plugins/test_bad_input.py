@@ -324,13 +324,6 @@ def test_parameters_of_and_beside_delta_lobes_that_are_fine(bsdf, parameter):
     checks.require_supported(analyse(scene))
 
 
-def test_normals_of_a_mirror_steer_its_reflection():
-    scene = load(box={"type": "cube", "bsdf": {"type": "conductor"}})
-    enabled(scene, "box.vertex_normals")
-    with pytest.raises(UnsupportedError, match=r"box\.vertex_normals"):
-        checks.require_supported(analyse(scene))
-
-
 # Warnings
 
 
