@@ -133,6 +133,7 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
+    pi.t = dr.select((job.frame.to_local @ ray(pi.t)).z < job.frame.far, pi.t, dr.inf)
     emission = mi.Bool(True)
     if job.options.hide_emitters:
         ray, pi = see_through_emitters(job.scene, ray, pi)

@@ -32,6 +32,7 @@ from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
+from ..scene.clipping import warn_about_clipping
 from ..scene.facts import SceneFacts, analyse
 from ..scene.painted_lights import warn_about_painted_lights
 from ..scene.stale_values import warn_about_stale_values
@@ -117,6 +118,8 @@ def prepare(call: Call) -> Prepared:
     warn_about_painted_lights(call.scene, facts, call.memory)
     if call.options.hide_emitters:
         warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
+    if facts.geometry_moves:
+        warn_about_clipping(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":
         warn_about_stale_values(call.scene, facts, call.memory)
     question = _Question(call, facts, budgets, Memory())

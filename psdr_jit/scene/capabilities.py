@@ -132,7 +132,7 @@ SUPPORT = (
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),
     Row("shape geometry, materials, textures", "yes", ""),
     Row("camera pose and intrinsics", "yes", ""),
-    Row("perspective, thin lens, orthographic sensor", "yes", ""),
+    Row("perspective, thin lens, orthographic sensor", "yes", "a clipping plane that cuts what is seen: warning"),
     Row("batch sensor", "yes", "its sensors are rendered one by one, uncropped; `sample_border` needs equal filters"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes",
