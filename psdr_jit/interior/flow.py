@@ -62,6 +62,12 @@ class SceneTraits:
     lights_rest: bool = False  # area lights stay where they are, and as large
     orbits: Orbits | None = None  # spheres that carry directions along (spatial flow only)
 
+    def scattered(
+        self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, ω: mi.Vector3f, active: mi.Bool
+    ) -> mi.Spectrum:
+        """f cosθ of light that leaves in the direction ω (world), attached to all that it depends on."""
+        return bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
+
 
 class Flow(ABC):
     """Host object of a job: the terms of a vertex as a function of how it is reached."""
@@ -163,8 +169,7 @@ def next_event(
     if traits.followed is not None:
         met = moves.surface(hit, mi.Ray3f(si.p, hit.d, 0, si.wavelengths), mi.RayFlags.All)
         value = dr.select(along, emitter.eval(met, along), value)
-    f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
-    return dr.select(active, f * value * nee.mis_over_pdf(), 0)
+    return dr.select(active, traits.scattered(si, bsdf, ω, active) * value * nee.mis_over_pdf(), 0)
 
 
 def emitter_behind(scene: mi.Scene, following: Arrival, si, active: mi.Bool) -> tuple[mi.EmitterPtr, mi.Bool]:

@@ -40,8 +40,7 @@ class MaterialFlow(Flow):
 
         goes_on = vertex.onward.goes_on()
         behind, ω, measure = material_segment(si.p, following.hit, si.wavelengths, moves, goes_on)
-        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), goes_on)
-        w = f * measure * vertex.onward.inv_pdf()
+        w = self.traits.scattered(si, bsdf, ω, goes_on) * measure * vertex.onward.inv_pdf()
         emitter, emits = emitter_behind(self.scene, following, behind, goes_on)
         value = emitter.eval(behind, emits)
         if self.traits.smooth_lights is not None:

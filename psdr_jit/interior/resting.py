@@ -32,8 +32,7 @@ class RestingFlow(Flow):
         L = dr.select(emits, vertex.weight_emission * si.emitter(self.scene).eval(si, emits), 0)
         L += self._next_event(si, bsdf, vertex)
         goes_on = vertex.onward.goes_on()
-        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(following.hit.d), goes_on)
-        w = f * vertex.onward.inv_pdf()
+        w = self.traits.scattered(si, bsdf, following.hit.d, goes_on) * vertex.onward.inv_pdf()
         if self.traits.delta_lobes:
             w = dr.select(vertex.onward.delta, delta_factor(vertex, following, si, bsdf), w)
         return VertexTerms(si.p, following.hit.d, L, w)
@@ -49,5 +48,4 @@ class RestingFlow(Flow):
             is_delta = active & nee.delta
             _, value_delta = emitter.sample_direction(si, mi.Point2f(0.5), is_delta)
             value = dr.select(is_delta, value_delta, value)
-        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(nee.d), active)
-        return dr.select(active, f * value * nee.mis_over_pdf(), 0)
+        return dr.select(active, self.traits.scattered(si, bsdf, nee.d, active) * value * nee.mis_over_pdf(), 0)

@@ -42,7 +42,6 @@ class SpatialFlow(Flow):
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
     ) -> VertexTerms:
-        ctx = mi.BSDFContext()
         si = moves.surface(vertex.hit, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         L = dr.select(first, vertex.weight_emission * si.emitter(self.scene).eval(si, first), 0)
@@ -50,7 +49,7 @@ class SpatialFlow(Flow):
 
         goes_on, inv_pdf = vertex.onward.goes_on(), vertex.onward.inv_pdf()
         onward, stretch = self._onward(si.p, vertex, following, goes_on, moves)
-        w = bsdf.eval(ctx, si, si.to_local(onward), goes_on) * stretch * inv_pdf
+        w = self.traits.scattered(si, bsdf, onward, goes_on) * stretch * inv_pdf
 
         emitter, emits = emitter_behind(self.scene, following, following.hit.intersection(), goes_on)
         along = mi.Bool(False) if self.traits.followed is None else self.traits.followed.has(emitter, emits)
@@ -59,10 +58,10 @@ class SpatialFlow(Flow):
         if self.traits.smooth_lights is not None:
             weighed = emits & ~along & ~vertex.onward.delta
             value *= self.traits.smooth_lights.of_ray(si, bsdf, light, ω, following.weight_emission, weighed)
-        w_emission = bsdf.eval(ctx, si, si.to_local(ω), emits) * inv_pdf
+        w_emission = self.traits.scattered(si, bsdf, ω, emits) * inv_pdf
         if self.traits.delta_lobes:
             is_delta = vertex.onward.delta
-            step = delta_step(ctx, si, bsdf, following.hit.d, is_delta)
+            step = delta_step(mi.BSDFContext(), si, bsdf, following.hit.d, is_delta)
             onward = dr.select(is_delta, step.d, onward)
             along |= is_delta
             w, w_emission = (dr.select(is_delta, step.value * inv_pdf, smooth) for smooth in (w, w_emission))
