@@ -35,6 +35,7 @@ from ..paths.edge_on import GRAZING, GRAZING_FLAT
 from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
 from ..paths.recording import PathRecords
+from ..paths.rough_plastic import RoughPlastic
 from ..paths.smooth_lights import SmoothLights
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
@@ -61,12 +62,15 @@ class SceneTraits:
     followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
     lights_rest: bool = False  # area lights stay where they are, and as large
     orbits: Orbits | None = None  # spheres that carry directions along (spatial flow only)
+    rough_plastic: RoughPlastic | None = None  # whose tables depend on a parameter
 
     def scattered(
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, ω: mi.Vector3f, active: mi.Bool
     ) -> mi.Spectrum:
         """f cosθ of light that leaves in the direction ω (world), attached to all that it depends on."""
-        return bsdf.eval(mi.BSDFContext(), si, si.to_local(ω), active)
+        wo = si.to_local(ω)
+        f = bsdf.eval(mi.BSDFContext(), si, wo, active)
+        return f if self.rough_plastic is None else f + self.rough_plastic.missing(si, bsdf, wo, active)
 
 
 class Flow(ABC):

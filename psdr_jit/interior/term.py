@@ -89,7 +89,7 @@ def _along_the_walk(job: Job, p: CameraPass) -> mi.Spectrum:
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
     sampler = p.sampler(dr.arange(mi.UInt32, p.samples.count))
     lights = any(e.radiance for e in job.facts.emitters)
-    sink = (RadianceTangents if lights else MaterialTangents).zero(job.facts.has_delta_lobes)
+    sink = (RadianceTangents if lights else MaterialTangents).zero(job.facts.has_delta_lobes, job.rough_plastic)
     walk(job.scene, sampler, ray, pi, _limits(job), sink, emission, mi.Bool(True))
     return job.call.counters.rejected.keep_finite(sink.dL)
 
@@ -138,7 +138,7 @@ def flow_of(job: Job) -> Flow:
     lights_rest = job.plan.prunes and job.learns and not (facts.emitters_move or _area_lights_change(facts))
     traits = SceneTraits(
         facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes, followed_lights(job), lights_rest,
-        job.orbits,
+        job.orbits, job.rough_plastic,
     )
     if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows
         return RestingFlow(job.scene, traits)

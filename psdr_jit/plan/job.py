@@ -20,6 +20,7 @@ from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.edge_on import EdgeOn
 from ..paths.light_technique import LightTechnique
 from ..paths.orbits import Orbits
+from ..paths.rough_plastic import RoughPlastic, rough_plastic
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from ..scene.tubes import Tubes, tubes_of
@@ -45,6 +46,9 @@ LIGHT: Slot[LightTechnique | None] = Slot(lambda: None)
 
 #: Of one render call: rough glass whose index is differentiated.
 CRITICAL: Slot[CriticalAngle | None] = Slot(lambda: None)
+
+#: Of one render call: rough plastic whose tables depend on a parameter.
+ROUGH_PLASTIC: Slot[RoughPlastic | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,13 @@ class Job:
         if not any(name.endswith(".eta") for shape in self.facts.shapes for name in shape.material):
             return None
         return self.shared.once(CRITICAL, lambda: critical_angle(self.scene))
+
+    @property
+    def rough_plastic(self) -> RoughPlastic | None:
+        """Rough plastic whose roughness or index is differentiated, read once per render call."""
+        if not any(name.endswith((".alpha", ".eta")) for shape in self.facts.shapes for name in shape.material):
+            return None
+        return self.shared.once(ROUGH_PLASTIC, lambda: rough_plastic(self.scene, self.call.memory))
 
     @property
     def orbits(self) -> Orbits | None:

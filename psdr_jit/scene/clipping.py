@@ -12,6 +12,7 @@ import numpy as np
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import KINDS, SensorFrame, sensor_frame
 from ..core.surface_code import top_level
+from ..core.upload import uploaded
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
@@ -40,16 +41,11 @@ def warn_about_clipping(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, m
 
 def _cut(scene: mi.Scene, sensor: mi.Sensor) -> list[tuple[str, int]]:
     """`(parameter, index of a shape)` of what is cut, each parameter once."""
-    with dr.suspend_grad():
-        frame = sensor_frame(sensor)
-        i = dr.arange(mi.UInt32, GRID * GRID)
-        film = (mi.Point2f(mi.Float(i % GRID), mi.Float(i // GRID)) + 0.5) / GRID
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
-        beyond = _met(scene, frame, mi.Ray3f(ray.o, ray.d))  # without its end: what lies behind far_clip as well
-        whole = _met(scene, frame, mi.Ray3f(ray.o - _way_back(scene, frame, ray) * ray.d, ray.d))
-    planes = (np.array(plane)[0] for plane in (frame.near, frame.far))
+    frame = sensor_frame(sensor)
+    eye, d, start, planes = _lines_of_sight(scene, frame)
     found = []
-    for name, (shape, z), plane in zip(("near_clip", "far_clip"), (whole, beyond), planes, strict=True):
+    for name, plane, before in (("near_clip", planes[0], start), ("far_clip", planes[1], np.array(0.0))):
+        shape, z = _met(scene, frame, eye - before * d, d)
         steps = [shape[:, 1:][_steps(shape, z < plane)], shape[1:][_steps(shape.T, (z < plane).T).T]]
         found += [(name, int(k)) for k in np.concatenate(steps)[:1]]
     return found
@@ -60,18 +56,37 @@ def _steps(shape: np.ndarray, before: np.ndarray) -> np.ndarray:
     return (shape[:, 1:] == shape[:, :-1]) & (shape[:, 1:] >= 0) & (before[:, 1:] != before[:, :-1])
 
 
-def _way_back(scene: mi.Scene, frame: SensorFrame, ray: mi.Ray3f) -> mi.Float:
-    """From the near plane to the pinhole (of a thin lens, its centre), or to before everything."""
-    if frame.kind == "orthographic":
-        sphere = scene.bbox().bounding_sphere()
-        return dr.norm(ray.o - mi.Point3f(sphere.center)) + sphere.radius
-    return frame.near / dr.dot(ray.d, dr.normalize(frame.to_world @ mi.Vector3f(0, 0, 1)))
+def _lines_of_sight(scene: mi.Scene, frame: SensorFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
+    """`(points on the near plane, unit directions, way back from there to before all that a plane may hide, planes)`,
+    (N, 3), (N, 3), (N, 1) and numbers, world space, through the middles of the cells of a grid on the film.
+
+    Made on the host: kernels of the sensor differ with what of its pose is known when they are compiled.
+    """
+    read = (frame.corner, frame.extent, frame.near, frame.far)
+    corner, extent, near, far = (np.array(v, float).ravel() for v in read)
+    across = (np.arange(GRID) + 0.5) / GRID
+    x, y = (np.ravel(v) for v in np.meshgrid(corner[0] + extent[0] * across, corner[1] + extent[1] * across))
+    pose = np.array(frame.to_world.matrix, float).reshape(4, 4)
+    parallel = frame.kind == "orthographic"
+    local = np.stack([x, y, np.ones_like(x)], 1) * (1 if parallel else near)
+    local[:, 2] = near
+    eye = local @ pose[:3, :3].T + pose[:3, 3]
+    d = np.tile(pose[:3, 2], (len(x), 1)) if parallel else eye - pose[:3, 3]  # of a thin lens, from its centre
+    length = np.linalg.norm(d, axis=1, keepdims=True)
+    sphere = scene.bbox().bounding_sphere()
+    outside = np.linalg.norm(eye - np.array(sphere.center, float).ravel(), axis=1, keepdims=True) + float(sphere.radius)
+    return eye, d / length, outside if parallel else length, (near[0], far[0])
 
 
-def _met(scene: mi.Scene, frame: SensorFrame, ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
+def _met(scene: mi.Scene, frame: SensorFrame, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`(number of the shape in the scene, -1 for none; how far along the view)` of first hits, (GRID, GRID) each."""
-    pi = scene.ray_intersect_preliminary(ray, coherent=True)
+    start, along = (kind(*(uploaded(mi.Float, axis) for axis in v.T))
+                    for kind, v in ((mi.Point3f, o), (mi.Vector3f, d)))  # fmt: skip
+    pi = scene.ray_intersect_preliminary(mi.Ray3f(start, along), coherent=True)
     numbers = registry_values(scene, {k: k + 1 for k in range(len(scene.shapes()))})
-    shape = np.array(dr.gather(mi.UInt32, numbers, top_level(pi), pi.is_valid())).astype(int) - 1
-    z = np.array((frame.to_local @ ray(dr.select(pi.is_valid(), pi.t, 0))).z)
-    return shape.reshape(GRID, GRID), z.reshape(GRID, GRID)
+    shape = dr.gather(mi.UInt32, numbers, top_level(pi), pi.is_valid())
+    t = dr.select(pi.is_valid(), pi.t, 0)
+    dr.eval(shape, t)
+    to_local = np.linalg.inv(np.array(frame.to_world.matrix, float).reshape(4, 4))
+    z = (o + np.array(t)[:, None] * d) @ to_local[2, :3] + to_local[2, 3]
+    return (np.array(shape).astype(int) - 1).reshape(GRID, GRID), z.reshape(GRID, GRID)
