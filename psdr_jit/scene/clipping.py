@@ -20,7 +20,9 @@ from .registry import registry_values
 
 GRID = 64  # camera rays along each side of the film
 
-#: Of an integrator: calls so far. It is looked at the calls 1, 2, 4, 8, ...
+EVERY = 16  # calls: things move while parameters are optimised
+
+#: Of an integrator: calls so far.
 CALLS: Slot[list[int]] = Slot(lambda: [0])
 
 
@@ -28,7 +30,7 @@ def warn_about_clipping(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, m
     """Warn once where neighbouring camera rays meet the same shape before and behind a clipping plane."""
     calls = memory[CALLS]
     calls[0] += 1
-    if calls[0] & (calls[0] - 1) or sensor.class_name() not in KINDS or dr.flag(dr.JitFlag.FreezingScope):
+    if calls[0] % EVERY != 1 or sensor.class_name() not in KINDS or dr.flag(dr.JitFlag.FreezingScope):
         return
     for name, shape in _cut(scene, sensor):
         known = next((f"'{s.name}'" for s in facts.shapes if s.index == shape), "a shape")
