@@ -65,10 +65,12 @@ def lobes_not_followed(graph: SceneGraph, bsdf: mi.BSDF | None) -> str:
         return "'hair' has a lobe that it never samples" if any(plugin_name(n) == "hair" for n in nodes) else ""
     for node in nodes:
         name = plugin_name(node)
+        inner = [child for child in graph.walk(node, skip=(mi.Shape,))[1:] if isinstance(child, mi.BSDF)]
+        if not any(_has_delta_lobe(child) for child in inner):
+            continue
         if name in BENT_NORMALS:
             return f"'{name}' bends the normals of a perfectly specular material"
-        inner = [child for child in graph.walk(node, skip=(mi.Shape,))[1:] if isinstance(child, mi.BSDF)]
-        if name == "mask" and any(_has_delta_lobe(child) for child in inner):
+        if name == "mask":
             return "'mask' covers a perfectly specular material"
     return ""
 
