@@ -41,7 +41,7 @@ def warn_about_stale_values(scene: mi.Scene, facts: SceneFacts, memory: Memory) 
         edges = _Edges(dr.graphviz_ad(as_string=True))
         shapes, params = scene.shapes(), mi.traverse(scene) if rendered_by_way else None
         lost = [s.name for s in smooth if not edges.arrive_at(mesh_buffers(shapes[s.index])[1])]
-        unused = [name for name in rendered_by_way if not edges.leave(params[name])]
+        unused = [name for name in rendered_by_way if name in params and edges.end_at(params[name])]
     for name in lost:
         _warn(f"the vertex normals of shape '{name}' do", f"{name}.{VERTEX_POSITIONS}", memory)
     for name in unused:
@@ -69,9 +69,13 @@ class _Edges:
         """Whether anything of `value` was computed from another variable of the graph."""
         return any(i in self._computed for i in _variables(value))
 
-    def leave(self, value) -> bool:
-        """Whether any variable of the graph was computed from `value`."""
-        return any(i in self._used for i in _variables(value))
+    def end_at(self, value) -> bool:
+        """Whether `value` is attached and no variable of the graph was computed from it.
+
+        It is not attached where another object has the name: a sensor that was loaded by itself is not in the scene.
+        """
+        found = list(_variables(value))
+        return bool(found) and not any(i in self._used for i in found)
 
 
 def _variables(value) -> Iterator[int]:

@@ -112,3 +112,16 @@ def test_poses_that_are_assigned_or_read_as_they_are_are_not_told(key: str):
     params.update()
     dr.backward(dr.mean(mi.render(scene, params, integrator=integrator(), spp=4), axis=None))
     assert dr.grad(shift)[0] != 0
+
+
+@pytest.mark.filterwarnings("error::psdr_jit.errors.UnsupportedWarning")
+def test_a_sensor_that_was_loaded_by_itself_is_not_taken_for_the_scene_s():
+    scene = scene_io.load_scene(scene_io.shipped_scene("cbox.xml"), res=8)
+    view = {"type": "perspective", "fov": 40, "film": {"type": "hdrfilm", "width": 8, "height": 8},
+            "to_world": mi.ScalarTransform4f().look_at([0, 1, 4], [0, 1, 0], [0, 1, 0])}  # fmt: skip
+    sensor = mi.load_dict(view)
+    params = mi.traverse(sensor)
+    dr.enable_grad(params["x_fov"])
+    params.update()
+    dr.backward(dr.mean(mi.render(scene, params, sensor=sensor, integrator=integrator(), spp=4), axis=None))
+    assert dr.grad(params["x_fov"])[0] != 0
