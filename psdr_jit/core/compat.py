@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..errors import UnsupportedError
 
@@ -65,8 +66,8 @@ def faces_buffer(mesh: mi.Mesh) -> mi.UInt32:
 
 
 def same_values(a: mi.UInt32 | mi.Float, b: mi.UInt32 | mi.Float) -> bool:
-    """Do two flat arrays agree? At once if they are one array."""
-    return a.index == b.index or (dr.width(a) == dr.width(b) and bool(dr.all(a == b)[0]))
+    """Do two flat arrays agree? At once if they are one array; else on the host, so that no kernel is met late."""
+    return a.index == b.index or (dr.width(a) == dr.width(b) and np.array_equal(np.array(a), np.array(b)))
 
 
 def pack_positions(points: mi.Point3f) -> mi.Float | mi.TensorXf:

@@ -8,7 +8,6 @@ from typing import Any, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .surface_code import registry_index
 
@@ -56,18 +55,6 @@ def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:
     Values are not compared, nor derivatives.
     """
     return [a.index for a in kept] == [a.index for a in arrays]
-
-
-def same_contents(kept: list[Any], arrays: list[Any]) -> bool:
-    """Do these flat JIT arrays, one by one, hold what the kept ones do? At once where they are those that were kept.
-
-    For what takes longer to make than to compare: parameters that are assigned anew in every call, to attach them,
-    are other arrays of the same content. Compared on the host, so that no kernel is met in the second call only.
-    """
-    if [dr.width(a) for a in kept] != [dr.width(b) for b in arrays]:
-        return False
-    changed = [(a, b) for a, b in zip(kept, arrays, strict=True) if a.index != b.index]
-    return all(np.array_equal(np.array(a), np.array(b)) for a, b in changed)
 
 
 def while_unchanged(kept: dict[K, tuple[list[Any], T]], key: K, arrays: list[Any], make: Callable[[], T]) -> T:

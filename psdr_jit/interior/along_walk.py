@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from ..core.ad import tangents
 from ..paths.delta_step import delta_step
-from ..paths.rough_plastic import RoughPlastic
+from ..paths.rough_plastic import RoughPlastic, eval_attached
 from ..paths.sink import NoSink, Scatter
 
 
@@ -41,8 +41,8 @@ class MaterialTangents(NoSink):
         nee, onward = s.nee, s.onward
         delta = onward.alive & onward.scattering.delta
         with dr.resume_grad():
-            f_em = self._eval(s, nee.ω, nee.seen)
-            f = self._eval(s, onward.scattering.wo, onward.alive & ~delta)
+            f_em = eval_attached(self.rough_plastic, s.si, s.bsdf, nee.ω, nee.seen)
+            f = eval_attached(self.rough_plastic, s.si, s.bsdf, onward.scattering.wo, onward.alive & ~delta)
             if self.delta_lobes:
                 step = delta_step(ctx, s.si, s.bsdf, s.si.to_world(onward.scattering.wo), delta)
                 f = dr.select(delta, step.value, f)
@@ -54,11 +54,6 @@ class MaterialTangents(NoSink):
         weight = onward.scattering.weight / onward.survival
         β_grad = self.β_grad * weight + dr.select(onward.alive, s.β * f_grad * onward.likelihood().inv_pdf(), 0)
         self.β_grad = dr.select(active & onward.alive, β_grad, self.β_grad)
-
-    def _eval(self, s: Scatter, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """f cosθ in the direction `wo` (local), attached."""
-        f = s.bsdf.eval(mi.BSDFContext(), s.si, wo, active)
-        return f if self.rough_plastic is None else f + self.rough_plastic.missing(s.si, s.bsdf, wo, active)
 
     def _from_lights(self, s: Scatter, f_em: mi.Spectrum) -> mi.Spectrum:
         """What the vertex sends back because lights change."""

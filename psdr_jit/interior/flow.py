@@ -35,7 +35,7 @@ from ..paths.edge_on import GRAZING, GRAZING_FLAT
 from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
 from ..paths.recording import PathRecords
-from ..paths.rough_plastic import RoughPlastic
+from ..paths.rough_plastic import RoughPlastic, eval_attached
 from ..paths.smooth_lights import SmoothLights
 from ..plan.motion import Displacements
 from ..scene.tubes import Tubes
@@ -68,9 +68,7 @@ class SceneTraits:
         self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, ω: mi.Vector3f, active: mi.Bool
     ) -> mi.Spectrum:
         """f cosθ of light that leaves in the direction ω (world), attached to all that it depends on."""
-        wo = si.to_local(ω)
-        f = bsdf.eval(mi.BSDFContext(), si, wo, active)
-        return f if self.rough_plastic is None else f + self.rough_plastic.missing(si, bsdf, wo, active)
+        return eval_attached(self.rough_plastic, si, bsdf, si.to_local(ω), active)
 
 
 class Flow(ABC):

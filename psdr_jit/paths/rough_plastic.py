@@ -96,6 +96,14 @@ class RoughPlastic:
         return found
 
 
+def eval_attached(
+    plastic: RoughPlastic | None, si, bsdf: mi.BSDFPtr, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Spectrum:
+    """f cosθ in the direction `wo` (local), attached to all that it depends on. `plastic`: None if there is none."""
+    f = bsdf.eval(mi.BSDFContext(), si, wo, active)
+    return f if plastic is None else f + plastic.missing(si, bsdf, wo, active)
+
+
 def _missing(coat: _Coat, f: mi.Spectrum, cosines: tuple[mi.Float, mi.Float]) -> mi.Spectrum:
     tables = coat.tables
     with dr.suspend_grad():
@@ -138,9 +146,9 @@ def rough_plastic(scene: mi.Scene, memory: Memory) -> RoughPlastic | None:
 
 def _warn_about_hidden(shape: mi.Shape, memory: Memory) -> None:
     """Of rough plastic that a shape shows by way of another BSDF, whose frame or weight is not known here."""
-    known = {id(bsdf) for _, bsdf in coats_of(shape.bsdf())}
+    known = [bsdf for _, bsdf in coats_of(shape.bsdf())]
     for bsdf in _below(shape.bsdf()):
-        if plugin_name(bsdf) == PLUGIN and id(bsdf) not in known and _differentiated(bsdf):
+        if plugin_name(bsdf) == PLUGIN and bsdf not in known and _differentiated(bsdf):
             warn_once(
                 f"the {PLUGIN} '{bsdf.id()}' is inside of a {plugin_name(shape.bsdf())}: what its base sends depends "
                 "on its roughness and index by tables, whose derivative is missing there; put it on the shape itself",

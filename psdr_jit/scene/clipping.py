@@ -23,14 +23,13 @@ GRID = 64  # camera rays along each side of the film
 EVERY = 16  # calls: things move while parameters are optimised
 
 #: Of an integrator: calls so far.
-CALLS: Slot[list[int]] = Slot(lambda: [0])
+CALLS: Slot[int] = Slot(int)
 
 
 def warn_about_clipping(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Warn once where neighbouring camera rays meet the same shape before and behind a clipping plane."""
-    calls = memory[CALLS]
-    calls[0] += 1
-    if calls[0] % EVERY != 1 or sensor.class_name() not in KINDS or dr.flag(dr.JitFlag.FreezingScope):
+    memory[CALLS] += 1
+    if memory[CALLS] % EVERY != 1 or sensor.class_name() not in KINDS or dr.flag(dr.JitFlag.FreezingScope):
         return
     for name, shape in _cut(scene, sensor):
         known = next((f"'{s.name}'" for s in facts.shapes if s.index == shape), "a shape")
@@ -70,8 +69,8 @@ def _lines_of_sight(scene: mi.Scene, frame: SensorFrame) -> tuple[np.ndarray, np
     x, y = (np.ravel(v) for v in np.meshgrid(corner[0] + extent[0] * across, corner[1] + extent[1] * across))
     pose = np.array(frame.to_world.matrix, float).reshape(4, 4)
     parallel = frame.kind == "orthographic"
-    local = np.stack([x, y, np.ones_like(x)], 1) * (1 if parallel else near)
-    local[:, 2] = near
+    scale = 1 if parallel else near[0]
+    local = np.stack([scale * x, scale * y, np.full_like(x, near[0])], 1)
     eye = local @ pose[:3, :3].T + pose[:3, 3]
     d = np.tile(pose[:3, 2], (len(x), 1)) if parallel else eye - pose[:3, 3]  # of a thin lens, from its centre
     length = np.linalg.norm(d, axis=1, keepdims=True)

@@ -29,7 +29,9 @@ def tangents_arrived(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts) -> I
         yield
         return
     with dr.resume_grad():
-        params = [mi.traverse(node) for node in dict.fromkeys((scene, sensor))]
+        params = [mi.traverse(scene)]
+        if sensor not in params[0].hierarchy:  # loaded on its own
+            params.append(mi.traverse(sensor))
         names = [(p, name) for p in params for name in p.keys() if name.rpartition(".")[2] in _LATE]
         late = [(p, name) for p, name in names if _has_tangent(p[name])]
         given = [type(p[name])(p[name]) for p, name in late]

@@ -23,10 +23,9 @@ def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
     """What is wrong with the pose of a shape, and the way out; "" where nothing is, or while a function is frozen."""
     if plugin not in (*GRID_SHAPES, "sphere", "cylinder"):
         return ""
-    matrix = on_host_or_none(graph.value(shape, POSE).matrix)
+    matrix = _pose_of(graph, shape)
     if matrix is None:
         return ""
-    matrix = matrix.reshape(4, 4)
     if plugin in GRID_SHAPES:
         return _TURNED if _turns(matrix) else ""
     if stretches(matrix, plugin):
@@ -43,16 +42,22 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
     """The same of an environment map."""
     if plugin != "envmap":
         return ""
-    matrix = on_host_or_none(graph.value(emitter, POSE).matrix)
+    matrix = _pose_of(graph, emitter)
     if matrix is None:
         return ""
-    axes = matrix.reshape(4, 4)[:3, :3]
+    axes = matrix[:3, :3]
     if np.abs(axes.T @ axes - np.eye(3)).max() <= UNEVEN_SCALE:
         return ""
     return (
         "has a to_world that does more than turn it, so that Mitsuba looks texels up by directions that are not of "
         "length 1: the derivative is by other texels; scale nothing, and give rotations axes of length 1"
     )
+
+
+def _pose_of(graph: SceneGraph, node: mi.Object) -> np.ndarray | None:
+    """(4, 4); None while a function is being frozen."""
+    matrix = on_host_or_none(graph.value(node, POSE).matrix)
+    return None if matrix is None else matrix.reshape(4, 4)
 
 
 def stretches(matrix: np.ndarray, plugin: str) -> bool:

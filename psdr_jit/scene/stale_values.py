@@ -22,14 +22,14 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
 
-# Last parts of the names of parameters that are rendered by way of what is computed from them.
+#: Last parts of the names of parameters that are rendered by way of what is computed from them.
 _COMPUTED_FROM = ("to_world", "x_fov", "cutoff_angle", "beam_width")
 
 
 def warn_about_stale_values(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> None:
     """Warn of parameters with gradients enabled that what Mitsuba renders with does not depend on. Each is named once.
 
-    For backward mode: in forward mode the tangents have reached the computed values before rendering.
+    For backward mode: in forward mode the tangents reach the computed values before rendering (`late_tangents`).
     """
     smooth = [s for s in facts.shapes if s.smooth and s.index >= 0 and VERTEX_POSITIONS in s.geometry]
     rendered_by_way = [name for name in facts.enabled if name.rpartition(".")[2] in _COMPUTED_FROM]
