@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import inverse_tables, planning_tables, rows, sentences, survey_tables, tables
+from benchmarks.sentences import place
 from psdr_jit.scene.capabilities import support_table
 
 README = rows.ROOT / "README.md"
+CUDA = "cuda"  # folder of rows measured with that backend
 EMPTY = "No rows are stored yet; `psdr bench` makes some."
 CHARTS = {
     "accuracy.png": "Relative error of the derivative image against seconds of rendering, per case and method",
@@ -64,7 +66,10 @@ def readme_charts(found: list[dict[str, Any]]) -> str:
     if of.get("public_scenes"):
         blocks.append(survey_tables.sentence(of["public_scenes"]))
     shown = [row for name in (*makers, "public_scenes") for row in of.get(name, ())]
-    return "\n\n".join(blocks) + "\n" + sentences.machines(shown) if blocks else EMPTY
+    if not blocks:
+        return EMPTY
+    places = [sentences.machines(shown), sentences.on_cuda(stored_rows(rows.RESULTS / CUDA))]
+    return "\n\n".join(blocks) + "\n" + " ".join(filter(None, places))
 
 
 def details(found: list[dict[str, Any]], folder: Path) -> str:
@@ -247,8 +252,8 @@ def circumstances(found: list[dict[str, Any]]) -> list[str]:
     for row in found:
         machine, v = row["machine"], row["versions"]
         text = (
-            f"{row['bench']}: {row['date'][:10]}, {machine['cores']} cores of {machine['cpu']}, "
-            f"Mitsuba {v['mitsuba']}, Dr.Jit {v['drjit']}, LLVM {v['llvm']}, {v['variant']}, commit {row['commit']}"
+            f"{row['bench']}: {row['date'][:10]}, {place(machine)}, "
+            f"Mitsuba {v['mitsuba']}, Dr.Jit {v['drjit']}, {backend(v)}, {v['variant']}, commit {row['commit']}"
         )
         groups.setdefault(text, []).append(row)
     lines = []
@@ -256,6 +261,11 @@ def circumstances(found: list[dict[str, Any]]) -> list[str]:
         loads = [row["load"] for row in groups[text]]
         lines.append(f"- {text}, load {min(loads):.1f} to {max(loads):.1f}")
     return ["\n".join(lines)]
+
+
+def backend(versions: dict[str, str]) -> str:
+    """What compiled the kernels."""
+    return f"CUDA {versions['cuda']}" if "cuda" in versions else f"LLVM {versions['llvm']}"
 
 
 def with_block(text: str, name: str, content: str) -> str:

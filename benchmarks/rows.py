@@ -31,12 +31,29 @@ def summary(values: Sequence[float]) -> dict[str, float]:
 def circumstances() -> dict[str, Any]:
     """Machine, load, versions and commit. Reading them needs an active variant."""
     return {
-        "machine": {"cpu": cpu_model(), "cores": len(os.sched_getaffinity(0)), "system": platform.system()},
+        "machine": machine(),
         "load": os.getloadavg()[0],  # processes that wanted to run in the last minute, this one included
         "versions": versions(),
         "commit": commit(),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores and system; for a CUDA variant the device and its driver as well."""
+    import mitsuba as mi
+
+    found = {"cpu": cpu_model(), "cores": len(os.sched_getaffinity(0)), "system": platform.system()}
+    return {**found, "gpu": gpu_model()} if mi.variant().startswith("cuda") else found
+
+
+def gpu_model() -> str:
+    """Name and driver of the first device, as NVIDIA's tool gives them."""
+    query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        return subprocess.run(query, capture_output=True, text=True, check=True).stdout.splitlines()[0].strip()
+    except (OSError, subprocess.CalledProcessError, IndexError):
+        return "unknown"
 
 
 def cpu_model() -> str:
@@ -51,9 +68,10 @@ def versions() -> dict[str, str]:
     import drjit as dr
     import mitsuba as mi
 
-    llvm = ".".join(str(part) for part in dr.detail.llvm_version())
-    return {"python": platform.python_version(), "mitsuba": mi.__version__, "drjit": dr.__version__, "llvm": llvm,
-            "variant": mi.variant()}  # fmt: skip
+    backend = "cuda" if mi.variant().startswith("cuda") else "llvm"
+    version = dr.detail.cuda_version() if backend == "cuda" else dr.detail.llvm_version()
+    return {"python": platform.python_version(), "mitsuba": mi.__version__, "drjit": dr.__version__,
+            backend: ".".join(str(part) for part in version), "variant": mi.variant()}  # fmt: skip
 
 
 def commit() -> str:

@@ -88,10 +88,33 @@ def cost(rows: list[Row]) -> str:
     )
 
 
+def place(machine: dict[str, Any]) -> str:
+    """Processor, and device where one was used."""
+    device = f"an {machine['gpu'].split(',')[0]} and " if "gpu" in machine else ""
+    return f"{device}{machine['cores']} cores of {machine['cpu']}"
+
+
 def machines(rows: list[dict[str, Any]]) -> str:
     """On what, and when, the rows were measured."""
-    kinds = ((row["machine"], row["versions"]["variant"]) for row in rows)
-    places = sorted({f"{machine['cores']} cores of {machine['cpu']}, {variant}" for machine, variant in kinds})
+    places = sorted({f"{place(row['machine'])}, {row['versions']['variant']}" for row in rows})
     days = sorted(row["date"][:10] for row in rows)
     when = days[0] if days[0] == days[-1] else f"{days[0]} to {days[-1]}"
     return f"Measured {when} on {' and '.join(places)}."
+
+
+def on_cuda(rows: list[Row]) -> str:
+    """How many gradient checks pass on a GPU, and what a backward pass costs there; empty without rows."""
+    checks = [row for row in rows if row["bench"] == "checks"]
+    if not checks:
+        return ""
+    passed = sum(row["verdict"] == "pass" for row in checks)
+    gpu = checks[0]["machine"]["gpu"].split(",")[0]
+    words = f"[On a GPU](benchmarks/results/cuda/README.md) ({gpu}) {passed} of {len(checks)} gradient checks pass"
+    passes = {row["method"]: row for row in rows if row["bench"] == "backward_cost" and "wall_ms" in row}
+    if not passes:
+        return f"{words}."
+    s = next(iter(passes.values()))["settings"]
+    took = {name.split(",")[0].split(" ")[0]: f"{row['wall_ms']['median']:.0f} ms" for name, row in passes.items()
+            if name in (f"{OURS}, every term", "prb") or name.startswith("prb_projective")}  # fmt: skip
+    peers = ", ".join(f"`{name}` {time}" for name, time in took.items() if name != OURS)
+    return f"{words}; a backward pass ({s['res']} x {s['res']}, {s['spp']} spp) takes {took[OURS]} there ({peers})."

@@ -10,6 +10,7 @@ from psdr_jit.core import film as films
 from psdr_jit.core.ad import leftovers_named
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
+from psdr_jit.core.spilling import spill_to_local_memory
 from psdr_jit.core.threads import alone
 from psdr_jit.driver.aovs import AovChannels, require_no_derivative
 from psdr_jit.driver.prepare import Prepared, prepare
@@ -66,12 +67,14 @@ class TermIntegrator(ADIntegrator):
         return self._image_of(scene).render(scene, sensor, seed, spp, develop, evaluate)
 
     def _image_of(self, scene):
+        spill_to_local_memory()
         return self._images[image_plugin(scene, self.options.hide_emitters)]
 
     def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
         """A render call of this integrator as data; `film`: in place of the sensor's own."""
         sensor = find_sensor(scene, sensor)
         film = film or sensor.film()
+        spill_to_local_memory()
         return Call(self, scene, sensor, film, self.options, self.memory, self.counters, seed, spp, mode)
 
     def _prepared(self, call: Call) -> Prepared:

@@ -26,5 +26,5 @@ def variant(request) -> str:
 
 @pytest.fixture
 def llvm() -> str:
-    """RGB on the CPU, for what does not depend on the backend."""
+    """RGB on the CPU, for what does not depend on the backend (or by PSDR_TEST_BACKEND, see `variants`)."""
     return activate("llvm_ad_rgb")

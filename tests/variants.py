@@ -1,6 +1,11 @@
-"""Mitsuba's variants, as far as this machine runs them."""
+"""Mitsuba's variants, as far as this machine runs them.
+
+PSDR_TEST_BACKEND=cuda has what runs with LLVM otherwise run on a device.
+"""
 
 from __future__ import annotations
+
+import os
 
 import drjit as dr
 import mitsuba as mi
@@ -9,8 +14,12 @@ import pytest
 BACKENDS = {"llvm": dr.JitBackend.LLVM, "cuda": dr.JitBackend.CUDA}
 
 
+IN_PLACE_OF_LLVM = os.environ.get("PSDR_TEST_BACKEND", "llvm")
+
+
 def activate(name: str) -> str:
     """Make `name` the active variant, or skip the test where its backend does not run."""
+    name = name.replace("llvm", IN_PLACE_OF_LLVM)
     if not dr.has_backend(BACKENDS[name.split("_")[0]]):
         pytest.skip(f"no backend for {name} on this machine")
     if name not in mi.variants():
@@ -19,3 +28,9 @@ def activate(name: str) -> str:
         mi.set_variant(name)
     mi.set_log_level(mi.LogLevel.Error)
     return name
+
+
+#: For tests that load such meshes.
+needs_meshes_without_faces = pytest.mark.skipif(
+    IN_PLACE_OF_LLVM == "cuda", reason="OptiX ends the process over meshes without faces"
+)

@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 import pytest
 from clusters import FILE, RES
+from variants import activate
 
 import psdr_jit
 from psdr_jit.scene import io as scene_io
@@ -15,7 +16,7 @@ from psdr_jit.scene import io as scene_io
 
 @pytest.fixture(scope="module")
 def scene() -> mi.Scene:
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     return scene_io.load_scene(FILE, **RES)
 
 

@@ -7,6 +7,7 @@ import time
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate
 
 from psdr_jit.derivative.check import check_gradient
 from psdr_jit.derivative.finite_differences import CentralDifference
@@ -122,7 +123,7 @@ def test_z_scores_of_honest_errors_are_standard_normal(truth):
 
 @pytest.fixture(scope="module")
 def card():
-    scene_io.use_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     return scene_io.load_scene(scene_io.shipped_scene("emissive_card.xml"))
 
 
@@ -179,7 +180,7 @@ def beside_a_border_of_pixels() -> mi.Scene:
 @pytest.mark.parametrize("hurry", [False, True])
 def test_a_failure_is_not_believed_before_a_smaller_step_was_tried(hurry):
     """Where there is time for it, it passes; where there is none, nobody knows."""
-    scene_io.use_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     said = []
 
     def linger(seconds, v):

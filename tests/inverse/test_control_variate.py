@@ -27,7 +27,7 @@ FIXED = {"type": "psdr_path", "max_depth": 2, "sppc": 4, "sppp": 4, "sppi": 4}
 def render(θ, seed, kept=1.0):
     """An image whose mean is θ. `kept`: correlation of its noise with that of other θ and the same seed."""
     common = np.random.default_rng(seed).normal(size=SHAPE)
-    own = np.random.default_rng((seed, int(1e6 * θ))).normal(size=SHAPE)
+    own = np.random.default_rng((*np.atleast_1d(seed), int(1e6 * θ))).normal(size=SHAPE)
     return (θ + NOISE * (kept * common + np.sqrt(1 - kept**2) * own)).astype(np.float32)
 
 

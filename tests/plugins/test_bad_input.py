@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate
 
 import psdr_jit
 from psdr_jit.cli.main import main
@@ -36,7 +37,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::psdr_jit.errors.UnsupportedWarn
 @pytest.fixture(autouse=True)
 def variant(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
 
 
 def look_at(distance: float = 4.0):

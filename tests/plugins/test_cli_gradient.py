@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from variants import activate
 
 from psdr_jit.cli.main import main
 from psdr_jit.derivative import finite_differences, images
@@ -164,7 +165,7 @@ def test_scene_options_reach_the_integrator():
     """psdr_path takes over the scene's path lengths; --max-depth wins; the reference has the same ones."""
     from psdr_jit.derivative import integrator_specs
 
-    scene_io.use_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     scene = scene_io.load_scene(CBOX, max_depth=3, rr_depth=77)
     spec = integrator_specs.integrator_spec(scene)
     assert spec == {"type": "psdr_path", "max_depth": 3, "rr_depth": 77, "hide_emitters": False}

@@ -32,7 +32,8 @@ def renderer():
 
 
 def by_torch(render, values):
-    inputs = [torch.tensor(value, requires_grad=True) for value in values]
+    device = "cuda" if mi.variant().startswith("cuda") else "cpu"  # or `dr.wrap` makes arrays of another backend
+    inputs = [torch.tensor(value, requires_grad=True, device=device) for value in values]
     image = dr.wrap(source="torch", target="drjit")(render)(*inputs)
     (image * image).mean().backward()
     return image, [np.array(x.grad.tolist()) for x in inputs]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import needs_meshes_without_faces
 
 import psdr_jit
 from psdr_jit.errors import OptionError, SceneError, UnsupportedError
@@ -79,6 +80,7 @@ def empty(points: list, faces: list) -> mi.Mesh:
     return mesh
 
 
+@needs_meshes_without_faces
 @pytest.mark.parametrize("name", [BOX, "m.vertex_positions"])
 @pytest.mark.parametrize(("points", "faces", "words"), [
     ([], [], "no vertices"), ([], [[0, 0, 0]], "no vertices"), (TRIANGLE, [], "no faces"),

@@ -63,6 +63,17 @@ def test_machines_are_named_once():
     assert sentences.machines([later, row]).startswith("Measured 2026-01-02 to 2026-02-03 on")
 
 
+def test_rows_of_a_gpu_are_summed_up():
+    gpu = {"cores": 16, "cpu": "CPU", "gpu": "NVIDIA X, 1.2"}
+    checks = [{"bench": "checks", "verdict": v, "machine": gpu} for v in ("pass", "pass", "fail")]
+    costs = [{"bench": "backward_cost", "method": m, "wall_ms": {"median": t}, "settings": {"res": 8, "spp": 2}}
+             for m, t in (("psdr_path, every term", 20.4), ("path (primal)", 1), ("prb", 7))]  # fmt: skip
+    assert sentences.on_cuda([]) == ""
+    assert "(NVIDIA X) 2 of 3 gradient checks pass." in sentences.on_cuda(checks)
+    assert sentences.on_cuda(checks + costs).endswith("(8 x 8, 2 spp) takes 20 ms there (`prb` 7 ms).")
+    assert sentences.place(gpu) == "an NVIDIA X and 16 cores of CPU"
+
+
 def test_pictures_are_linked_from_where_the_page_is(tmp_path):
     (tmp_path / "charts").mkdir()
     (tmp_path / "charts" / "cost.png").touch()

@@ -19,7 +19,9 @@ def leave_pane(u: mi.Float, cos: float, inside: bool, plugin: str = "dielectric"
     up = -1 if inside else 1
     d = mi.Vector3f(float(np.sqrt(1 - cos**2)), 0, -up * cos)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0) - d, d))
-    return leave(si, mi.UInt32(0), mi.Point2f(0.5, u), None, mi.Bool(True), mi.BSDFContext())
+    onward = leave(si, mi.UInt32(0), mi.Point2f(0.5, u), None, mi.Bool(True), mi.BSDFContext())
+    dr.eval(onward)  # with CUDA, no kernel traces rays in two scenes
+    return onward
 
 
 def even() -> mi.Float:

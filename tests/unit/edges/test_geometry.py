@@ -7,6 +7,7 @@ import edge_oracle as oracle
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate
 
 from psdr_jit.edges.geometry import edge_geometry, upload_topology
 from psdr_jit.edges.topology import build_edge_topology
@@ -14,7 +15,7 @@ from psdr_jit.edges.topology import build_edge_topology
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
 
 
 def on_device(p, f):

@@ -41,6 +41,7 @@ def rays(distance: float) -> mi.Ray3f:
 def of_both(scene: mi.Scene, ray: mi.Ray3f, how: dict, ray_moves: bool) -> tuple[list, np.ndarray]:
     """`([(values, tangents) of ours, of Mitsuba's], cosines of arrival)`: of `FIELDS`, where something is met."""
     pi = scene.ray_intersect_preliminary(ray)
+    dr.eval(pi)  # before the scene changes: with CUDA it is built anew
     found = []
     for ours in (True, False):
         perturb(scene, "rod.to_world", **how).attach()

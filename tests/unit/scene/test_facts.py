@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate, needs_meshes_without_faces
 
 from psdr_jit.core import compat
 from psdr_jit.edges.segments import warn_about_mesh
@@ -22,7 +23,7 @@ from psdr_jit.scene.params import find_param
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
 
 
 def load(sensor=None, **objects):
@@ -425,6 +426,7 @@ def test_stretched_shapes(plugin, matrix, uneven):
     assert not complaints(facts_of(load(**scene), NOTHING_MOVES))
 
 
+@needs_meshes_without_faces
 def test_empty_meshes():
     facts = facts_of(load(void=mi.Mesh("void", 0, 0)), NOTHING_MOVES)
     with pytest.raises(SceneError, match="'void' .* no faces"):

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate
 
 import psdr_jit
 from psdr_jit.cli.main import main
@@ -46,7 +47,7 @@ smoothness = 0
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     (tmp_path / "s.xml").write_text(XML)
 
 

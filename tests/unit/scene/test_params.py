@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from variants import activate
 
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.errors import ParameterError
@@ -16,7 +17,7 @@ EPS = 1e-2
 
 @pytest.fixture(scope="module")
 def scene():
-    mi.set_variant("llvm_ad_rgb")
+    activate("llvm_ad_rgb")
     T = mi.ScalarTransform4f
     texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((4, 4, 3), 0.5, dtype=np.float32))}
     return mi.load_dict({
