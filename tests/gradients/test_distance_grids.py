@@ -67,7 +67,7 @@ def test_how_a_grid_is_shaded_is_found_out(llvm, normals):
 def test_its_surface_moves_with_its_values(llvm, normals):
     """Points and normals are Mitsuba's, their derivatives those of rays that are traced anew."""
     if llvm.startswith("cuda"):
-        pytest.skip("textures of CUDA have weights of 8 bits: Mitsuba's normals are known to 0.002, differences not at all")
+        pytest.skip("textures of CUDA have weights of 8 bits: Mitsuba's normals are known to 0.002")
     scene = scene_of(blob=grid(blob(9), normals))
     shape, params, rng = scene.shapes()[1], mi.traverse(scene), np.random.default_rng(0)
     target = mi.Point3f(*(mi.Float(rng.uniform(-0.8, 0.8, 4000)) for _ in range(3)))
