@@ -20,6 +20,7 @@ from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, Sight
 from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
+from ..paths.tube_surface import surface_at
 from ..paths.walk import walk
 from ..plan.job import Job
 from ..sampling.guided import guided
@@ -93,7 +94,7 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
         pdf_sa = dr.select(open_end, pdf_sa + through.pdf_reversed, pdf_sa)
     valid = line.valid & pi.is_valid()
     if job.facts.has_delta_lobes:  # smooth lobes receive nothing there
-        valid &= ~lies_within(on.x, pi, down)
+        valid &= ~lies_within(job, on.x, pi, down)
     view = EdgeView(
         lane=line.lane,
         sight=Sight.of(on, line.row, line.t, ω, pi.t + on.lead, n_perp),
@@ -106,13 +107,13 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     return compact(view, valid)
 
 
-def lies_within(x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:
+def lies_within(job: Job, x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:
     """Does `ray` from an edge point x lie within the plane of what it meets, as far as rounding tells?
 
     It then meets a face of the edge itself, or one in line with it, where it should pass along. A mirror there would
     receive it with a weight of 1/(n·ω).
     """
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, hit.is_valid())
+    si = surface_at(job.tubes, hit, ray, mi.RayFlags.Minimal, hit.is_valid())
     return dr.abs(dr.dot(si.n, x - si.p)) <= ROUNDING * dr.max(dr.abs(x))
 
 

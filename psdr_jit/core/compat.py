@@ -46,6 +46,13 @@ def mesh_buffers(mesh: mi.Mesh) -> tuple:
             mesh.faces_buffer())  # fmt: skip
 
 
+def normals_buffer(mesh: mi.Mesh) -> mi.Float:
+    """The array that holds the vertex normals, replaced whenever they change; may be empty."""
+    if not INDEXED_MESHES:
+        return mesh.vertex_normals_buffer()
+    return _parameter(mesh, VERTEX_NORMALS).array if mesh.has_vertex_normals() else mi.Float()
+
+
 def texcoords_buffer(mesh: mi.Mesh) -> mi.Float:
     """The array that holds the texture coordinates of the vertices, replaced whenever they change; may be empty."""
     if not INDEXED_MESHES:

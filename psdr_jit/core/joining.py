@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,9 +15,15 @@ import mitsuba as mi
 import numpy as np
 
 from .upload import uploaded
+from .varying import varying
 
 #: Arrays up to which they are joined on the device.
 FEW = 8
+
+#: How many joined arrays are kept, with those they are made of: a kept array is replaced when it is written to, so that
+#: its index stands for its values. A call joins about ten.
+KEPT = 32
+_JOINED: OrderedDict[tuple, tuple[list, Any]] = OrderedDict()
 
 
 def joined(arrays: Sequence[Any]) -> Any:
@@ -36,12 +43,24 @@ def joined(arrays: Sequence[Any]) -> Any:
 
 
 def _by_host(kind: type, arrays: list[Any]) -> Any:
-    result = uploaded(kind, np.concatenate([np.array(dr.detach(array)).ravel() for array in arrays]))
+    """What is attached is read anew; all else only if it was not among what was joined last."""
+    moves = [dr.grad_enabled(array) for array in arrays]
+    still = [dr.detach(array) for array, own in zip(arrays, moves, strict=True) if not own]
+    key = (kind, *(-dr.width(array) if own else array.index for array, own in zip(arrays, moves, strict=True)))
+    if key in _JOINED:
+        _JOINED.move_to_end(key)
+    else:
+        whole = np.concatenate([np.array(dr.detach(array)).ravel() for array in arrays])
+        _JOINED[key] = (still, uploaded(kind, whole))
+        if len(_JOINED) > KEPT:
+            _JOINED.popitem(last=False)
+    result = kind(_JOINED[key][1])
     start = 0
-    for array in arrays:
+    for array, own in zip(arrays, moves, strict=True):
         size = dr.width(array)
-        if dr.grad_enabled(array):
-            dr.scatter(result, array, dr.arange(mi.UInt32, size) + start, mode=dr.ReduceMode.Permute)
+        if own:
+            place = dr.arange(mi.UInt32, size) + varying(mi.UInt32, start)
+            dr.scatter(result, array, place, mode=dr.ReduceMode.Permute)
         start += size
     return result
 

@@ -171,7 +171,7 @@ def _between_faces(
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count
         if rows is not None:
-            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre))
+            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.tubes))
     dr.eval([kind.rows for kind in kinds])  # now, not with the term that needs them first: its kernels would differ
     return kinds, hidden
 

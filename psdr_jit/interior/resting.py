@@ -42,7 +42,7 @@ class RestingFlow(Flow):
         nee, active = vertex.nee, vertex.nee.emitter != 0
         emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
         ray = mi.Ray3f(si.p, nee.d, 0, si.wavelengths)
-        source = nee.hit(si.p).intersection().compute_surface_interaction(ray, mi.RayFlags.All, active)
+        source = surface_at(self.traits.tubes, nee.hit(si.p).intersection(), ray, mi.RayFlags.All, active)
         value = emitter.eval(source, active)
         if self.traits.delta_emitters:
             is_delta = active & nee.delta

@@ -23,6 +23,7 @@ from ..core.tube_axis import Axis
 from ..core.upload import uploaded
 from .facts import SceneFacts, ShapeFacts
 from .grids import TO_WORLD, MovingGrid, moving_grids
+from .mesh_tables import MeshTables, mesh_tables
 from .registry import registry_table
 
 T = TypeVar("T", bound="Segments")
@@ -141,10 +142,14 @@ class Tubes:
     grids: list[MovingGrid]
     ellipsoids: Ellipsoids | None
     cylinders: Cylinders | None
+    meshes: MeshTables | None = None  # where there is nothing else
 
 
 def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
-    """The curves, cylinders and moving grids of `scene`; None if there are none."""
+    """The curves, cylinders and moving grids of `scene`, or its meshes; None if Mitsuba evaluates every surface."""
+    meshes = mesh_tables(scene, memory)
+    if meshes is not None:
+        return Tubes(None, None, [], None, None, meshes)
     curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
     grids = moving_grids(scene, facts, memory)
     ellipsoids = [s for s in facts.shapes if s.kind == "ellipsoids" and s.index >= 0]

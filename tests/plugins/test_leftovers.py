@@ -9,27 +9,56 @@ import pytest
 import psdr_jit
 from psdr_jit.errors import UnsupportedError
 
+MOVER = "blocker.to_world"
 
-def cbox() -> mi.Scene:
-    return mi.load_file(str(psdr_jit.scene_io.shipped_scene("cbox.xml")), res=8, optimize=False)
+
+def shipped(name: str) -> mi.Scene:
+    return mi.load_file(str(psdr_jit.scene_io.shipped_scene(f"{name}.xml")), res=8, optimize=False)
+
+
+def attach_light(scene: mi.Scene) -> mi.SceneParameters:
+    """As an optimisation leaves its pose."""
+    params, x = mi.traverse(scene), mi.Float(0.1)
+    dr.enable_grad(x)
+    params["light.to_world"] = mi.Transform4f().translate(mi.Vector3f(x, 0, 0)) @ params["light.to_world"]
+    params.update()
+    return params
+
+
+def detach_light(params: mi.SceneParameters) -> None:
+    params["light.to_world"] = dr.detach(params["light.to_world"])
+    params.update()
 
 
 @pytest.mark.parametrize("same", [True, False], ids=["the same scene", "another scene"])
 def test_forward_mode_says_what_to_detach(llvm, same):
     """Dr.Jit's calls reach all scenes that are alive. Once it is detached, all is well."""
-    scene = cbox()
-    params = mi.traverse(scene)
-    key, x = "light.to_world", mi.Float(0.1)
-    dr.enable_grad(x)
-    params[key] = mi.Transform4f().translate(mi.Vector3f(x, 0, 0)) @ mi.Transform4f(params[key].matrix)
-    params.update()
-    asked = scene if same else cbox()
+    scene = shipped("ball_shadow")
+    params = attach_light(scene)
+    asked = scene if same else shipped("ball_shadow")
 
     def derivative():
-        return psdr_jit.gradient(asked, "small-box.vertex_positions", (1, 0, 0), spp=1, seeds=1)
+        return psdr_jit.gradient(asked, MOVER, (1, 0, 0), spp=1, seeds=1)
 
     with pytest.raises(UnsupportedError, match=r"dr\.detach\(params\[key\]\)"):
         derivative()
-    params[key] = dr.detach(params[key])
-    params.update()
+    detach_light(params)
     derivative()
+
+
+@pytest.mark.parametrize("same", [True, False], ids=["the same scene", "another scene"])
+def test_among_meshes_alone_it_can_tell(llvm, same):
+    """Their surfaces are asked for without a call: what is attached and has no tangent brings nothing."""
+    scene = shipped("area_shadow")
+    params = attach_light(scene)
+    asked = scene if same else shipped("area_shadow")
+    ours = {"type": "psdr_path", "sppc": 16, "sppp": 16, "sppi": 16}
+    found = psdr_jit.gradient(asked, "blocker.vertex_positions", (1, 0, 0), seeds=1, integrator=ours).total
+    detach_light(params)
+    fresh = shipped("area_shadow")
+    if same:
+        moved = mi.traverse(fresh)
+        moved["light.to_world"] = params["light.to_world"]
+        moved.update()
+    expected = psdr_jit.gradient(fresh, "blocker.vertex_positions", (1, 0, 0), seeds=1, integrator=ours).total
+    assert abs(expected).max() > 0 and abs(found - expected).max() < 1e-4 * abs(expected).max()

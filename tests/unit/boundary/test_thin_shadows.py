@@ -32,4 +32,4 @@ def test_the_rim_of_a_sphere(scene, x, towards_light, thin):
     ray = mi.Ray3f(mi.Point3f(x, 0, 0) + 0.05 * ω, -ω)
     hit = scene.ray_intersect_preliminary(ray)
     assert dr.all(dr.abs(hit.t - 0.05) < 1e-5)
-    assert dr.all(thinner_than_lift(scene, hit, ray, mi.Bool(True)) == thin)
+    assert dr.all(thinner_than_lift(scene, None, hit, ray, mi.Bool(True)) == thin)

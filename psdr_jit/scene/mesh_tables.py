@@ -1,0 +1,172 @@
+"""The meshes of a scene as tables, from which a surface is looked up whichever mesh it is on.
+
+Mitsuba's `compute_surface_interaction` is a virtual call: Dr.Jit records the function of every shape anew, with its
+adjoint, each time a surface is asked for. In a scene of a hundred meshes that is four fifths of a derivative's time
+outside of kernels. With all vertices in one array and all faces in another it is a few gathers, whose number does not
+depend on the scene (`paths.mesh_surface`).
+
+Of meshes that move, vertices are read from arrays of their own, variables which stand for Mitsuba's while a render call
+lasts: in forward mode they take over the tangents before the terms run, in backward mode they hand on what they have
+gathered after that. A loop can add to the gradient of a variable, and not to that of what was computed outside of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.ad import backpropagate, tangents
+from ..core.compat import faces_buffer, normals_buffer, positions_buffer, texcoords_buffer
+from ..core.joining import joined
+from ..core.memory import Memory, Slot, while_unchanged
+from ..core.upload import uploaded
+from ..core.varying import varying
+
+#: What is known of a shape; bits of `MeshTables.traits`.
+SMOOTH, TEXTURED, FLIPPED, MOVES = (1 << k for k in range(4))
+
+#: Of an integrator: the tables of meshes that rest.
+TABLES: Slot[dict] = Slot(dict)
+
+
+@dataclass(frozen=True)
+class Vertices:
+    """Vertices of meshes, mesh after mesh, flat. Meshes without normals or texture coordinates have zeros there."""
+
+    positions: mi.Float
+    normals: mi.Float
+    texcoords: mi.Float
+
+
+FIELDS = tuple(field.name for field in fields(Vertices))
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Meshes whose vertices are differentiated; host object."""
+
+    sources: tuple[Vertices, ...]  # Mitsuba's arrays, by mesh
+    vertices: Vertices  # variables of their own in place of them
+
+    def take_tangents(self) -> None:
+        """Give the variables the tangents of Mitsuba's arrays."""
+        with dr.resume_grad():
+            for name in FIELDS:
+                variable = getattr(self.vertices, name)
+                if dr.grad_enabled(variable):
+                    dr.set_grad(variable, joined([tangents(getattr(source, name)) for source in self.sources]))
+
+    def hand_on(self) -> None:
+        """Add the gradients of the variables to those of Mitsuba's arrays."""
+        with dr.resume_grad():
+            for name in FIELDS:
+                start, grad = 0, dr.grad(getattr(self.vertices, name))
+                for source in self.sources:
+                    array = getattr(source, name)
+                    size = dr.width(array)
+                    if dr.grad_enabled(array):
+                        part = dr.gather(mi.Float, grad, dr.arange(mi.UInt32, size) + varying(mi.UInt32, start))
+                        backpropagate(array * varying(mi.Float, 1), part)
+                    start += size
+
+
+@dataclass(frozen=True)
+class MeshTables:
+    """The meshes of a scene that has no other shapes, by registry index; and their vertices. Detached but for `moving`.
+    """
+
+    traits: mi.UInt32  # what is known of it
+    first_face: mi.UInt32  # the number of its first face among all
+    shift: mi.UInt32  # of a mesh that moves: from numbers of vertices among all to numbers among those that move
+    faces: mi.UInt32  # numbers of vertices among all: corners of all faces, flat
+    vertices: Vertices  # of all
+    moving: Moving | None
+    smooth: bool  # do some have vertex normals?
+    textured: bool  # do some have texture coordinates?
+
+
+def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
+    """The tables of a scene of meshes alone; None if there are other shapes.
+
+    They are made anew only when an array of a mesh that rests has been replaced.
+    """
+    meshes = scene.shapes()
+    if not meshes or not all(shape.is_mesh() for shape in meshes):
+        return None
+    ids = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    with dr.resume_grad():
+        moves = [dr.grad_enabled(_buffers(mesh)) for mesh in meshes]
+        moving = _moving([mesh for mesh, own in zip(meshes, moves, strict=True) if own]) if any(moves) else None
+    traits = [_traits(mesh) | (MOVES if own else 0) for mesh, own in zip(meshes, moves, strict=True)]
+    arrays = [faces_buffer(mesh) for mesh in meshes]
+    arrays += [buffer for mesh, own in zip(meshes, moves, strict=True) if not own for buffer in _buffers(mesh)]
+    with dr.suspend_grad():
+        key = (*ids.tolist(), *traits)
+        tables = while_unchanged(memory[TABLES], key, arrays, lambda: _tables(meshes, ids, traits))
+    return replace(tables, moving=moving)
+
+
+def _traits(mesh: mi.Mesh) -> int:
+    found = 0
+    for trait, there in ((SMOOTH, mesh.has_vertex_normals()), (TEXTURED, mesh.has_vertex_texcoords()),
+                         (FLIPPED, mesh.has_flipped_normals())):  # fmt: skip
+        found |= trait if there else 0
+    return found
+
+
+def _buffers(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Positions, normals and texture coordinates; empty where it has none."""
+    return positions_buffer(mesh), normals_buffer(mesh), texcoords_buffer(mesh)
+
+
+def _vertices(mesh: mi.Mesh) -> Vertices:
+    """Mitsuba's arrays, attached if they are, and zeros in place of those that it does not have."""
+    sizes = (3 * mesh.vertex_count(), 3 * mesh.vertex_count(), 2 * mesh.vertex_count())
+    return Vertices(*(array if dr.width(array) == size else dr.zeros(mi.Float, size)
+                      for array, size in zip(_buffers(mesh), sizes, strict=True)))  # fmt: skip
+
+
+def _joined(parts: Sequence[Vertices]) -> Vertices:
+    """Detached and evaluated."""
+    found = Vertices(*(mi.Float(joined([dr.detach(getattr(part, name)) for part in parts])) for name in FIELDS))
+    dr.eval(found)
+    return found
+
+
+def _moving(meshes: Sequence[mi.Mesh]) -> Moving:
+    sources = tuple(_vertices(mesh) for mesh in meshes)
+    own = _joined(sources)
+    for name in FIELDS:
+        arrays = [getattr(source, name) for source in sources]
+        if dr.grad_enabled(arrays):
+            dr.enable_grad(getattr(own, name))
+    return Moving(sources, own)
+
+
+def _tables(meshes: Sequence[mi.Mesh], ids: np.ndarray, traits: Sequence[int]) -> MeshTables:
+    """Without what moves. `ids`: registry indices."""
+    vertices, faces = (np.array([count(mesh) for mesh in meshes])
+                       for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))  # fmt: skip
+    first_vertex, first_face = _first(vertices), _first(faces)
+    moves = np.array(traits) & MOVES != 0
+    shift = _first(np.where(moves, vertices, 0)) - first_vertex
+    corners = joined([faces_buffer(mesh) for mesh in meshes]) + uploaded(mi.UInt32, np.repeat(first_vertex, 3 * faces))
+    dr.eval(corners)
+
+    def by_shape(values: np.ndarray) -> mi.UInt32:
+        table = np.zeros(ids.max() + 1, np.int64)
+        table[ids] = values
+        return uploaded(mi.UInt32, table.astype(np.uint32))  # differences below 0 wrap around, and back
+
+    return MeshTables(by_shape(np.array(traits)), by_shape(first_face), by_shape(shift), corners,
+                      _joined([_vertices(mesh) for mesh in meshes]), None, any(t & SMOOTH for t in traits),
+                      any(t & TEXTURED for t in traits))  # fmt: skip
+
+
+def _first(counts: np.ndarray) -> np.ndarray:
+    """Where each of several runs with so many entries begins."""
+    return np.cumsum(counts) - counts
