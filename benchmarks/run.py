@@ -189,7 +189,8 @@ def main(argv: list[str] | None = None) -> int:
         return report.write(args.out)
     wanted = tasks(args)
     if not wanted:
-        print("psdr bench: error: no case and method has such a name; see: psdr bench --list", file=sys.stderr)
+        quick = " --quick" if args.quick else ""
+        print(f"psdr bench: error: no case and method has such a name; see: psdr bench{quick} --list", file=sys.stderr)
         return USAGE
     if args.list:
         print("\n".join(f"{task.suite}: {task.case}: {task.method}" for task in wanted))

@@ -9,6 +9,7 @@ that `psdr --help` needs neither Mitsuba nor time.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import sys
@@ -138,6 +139,8 @@ def explained(error: BaseException) -> tuple[int, str]:
             return SETUP_MISSING if lacking else USAGE, f"error: {found}"
         if isinstance(found, MemoryError) or "out of memory" in str(found):
             return SETUP_MISSING, "error: out of memory: use fewer samples per pixel, or a smaller image"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return SETUP_MISSING, f"error: {error.strerror.lower()}: make room where the output goes"
     if isinstance(error, ModuleNotFoundError) and (error.name or "psdr_jit").split(".")[0] != "psdr_jit":
         return SETUP_MISSING, f"error: the package '{error.name}' is not installed; see: psdr doctor"
     shown = behind[-1] if "see above" in str(error) else error  # so says Dr.Jit, and its user sees nothing above

@@ -91,7 +91,7 @@ def observers_of(args: argparse.Namespace) -> list[Any]:
 
 def describe(result: Any, out: Path, seconds: float) -> str:
     """What became of the run, in a few lines."""
-    loss = f"loss {result.loss:.3e} (mean of the last)"
+    loss = f"loss {result.loss:.3e} (mean of the last ones)"
     lines = [f"{result.status} after {result.iterations} iterations, {seconds:.1f} s; {loss}"]
     for name, now in result.offsets.items():
         for kind, value in now.items():

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help=".exr or .png (default: the scene's name with .exr, in this folder)")
     parser.add_argument("--spp", type=int, help="samples per pixel (default: the scene's own)")
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default: 0)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 

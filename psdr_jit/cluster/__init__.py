@@ -1,6 +1,6 @@
 """Work on many machines: Dask `distributed` hands it out, this room says what a worker needs and what may go wrong.
 
-    pip install 'mitsuba-psdr[cluster]'             # the same versions everywhere; others are refused by name
+    pip install '.[cluster]'    # in a clone; the same versions everywhere; others are refused by name
 
 Processes of one machine need nothing else: `psdr gradient ... --workers 2`, `psdr optimize ... --workers 2`, or
 

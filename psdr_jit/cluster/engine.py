@@ -41,7 +41,7 @@ def require_dask() -> Any:
         import distributed
     except ImportError as error:
         raise SetupError(
-            "several machines or processes need Dask, which is not installed: pip install 'mitsuba-psdr[cluster]'"
+            "several machines or processes need Dask, which is not installed: pip install 'distributed>=2024.1'"
         ) from error
     return distributed
 

@@ -192,7 +192,7 @@ def seen_distance(scene: mi.Scene, sensor: Any) -> float:
     with dr.suspend_grad():
         i = dr.arange(mi.UInt32, SEEN_GRID**2)
         film = (mi.Point2f(mi.Float(i % SEEN_GRID), mi.Float(i // SEEN_GRID)) + 0.5) / SEEN_GRID
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
+        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))  # all have it
         t = np.array(scene.ray_intersect_preliminary(ray, coherent=True).t)
     met = t[np.isfinite(t)]
     return float(np.median(met)) if len(met) else np.inf

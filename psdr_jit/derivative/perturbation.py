@@ -149,7 +149,7 @@ def _motion(common: dict, base: Any, direction: Any, rotate: Any) -> Perturbatio
     name = common["info"].name
     if direction is None and rotate is None:
         raise ParameterError(f"'{name}' needs a direction: direction=(dx, dy, dz) or rotate=(ax, ay, az) "
-                             "(--direction / --rotate on the command line)")
+                             "(on the command line --direction, --rotate), or index= (--index) for one of its numbers")
     vector = _numbers(direction if rotate is None else rotate, "the direction of motion")
     if vector.size != 3:
         raise ParameterError(f"the direction of '{name}' must have 3 numbers, or as many as the parameter itself, "
@@ -218,7 +218,8 @@ def _addition(common: dict, base: Any, direction: Any, index: int | None) -> Per
     else:
         flat, label = _numbers(direction, "the direction"), "a given direction"
         if flat.size not in (1, size):
-            raise ParameterError(f"the direction of '{name}' must have 1 or {size} numbers, got {flat.size}")
+            wanted = "1 number" if size == 1 else f"1 or {size} numbers"
+            raise ParameterError(f"the direction of '{name}' must have {wanted}, got {flat.size}")
         flat = np.broadcast_to(flat, (size,))
     step = _like(base, flat)
     if name.endswith(("vertex_positions", CONTROL_POINTS)):   # a deformation: its step is a length

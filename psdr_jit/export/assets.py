@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,12 +27,7 @@ class Assets:
 
     def add(self, name: str, content: bytes) -> str:
         """Keep a file under a name like this one; what the scene file has to call it."""
-        stem, suffix = os.path.splitext(re.sub(r"[^\w.-]", "_", name))
-        name, count = stem + suffix, 1
-        while self.contents.get(name, content) != content:
-            name, count = f"{stem}_{count}{suffix}", count + 1
-        self.contents[name] = content
-        return f"{self.folder}/{name}"
+        return f"{self.folder}/{add_file(self.contents, name, content)}"
 
     def source_of(self, node: Node) -> Path:
         """The file that an object was read from. Raises `SceneError` if it is gone."""
@@ -51,6 +45,18 @@ class Assets:
             if isinstance(named, str) and not named.startswith(f"{self.folder}/"):
                 path = self.source_of(node)
                 node.entries[FILE] = self.add(path.name, path.read_bytes())
+
+
+def add_file(contents: dict[str, bytes], name: str, content: bytes) -> str:
+    """Keep `content` among other files, under a name like this one that every system takes; the name."""
+    stem, point, ending = name.rpartition(".")
+    suffix = point + ending
+    stem = re.sub(r"[^\w.-]+", "_", stem).strip("_.") or "file"
+    name, count = stem + suffix, 1
+    while contents.get(name, content) != content:
+        name, count = f"{stem}_{count}{suffix}", count + 1
+    contents[name] = content
+    return name
 
 
 def mesh(shape: mi.Mesh) -> bytes:

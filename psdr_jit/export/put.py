@@ -144,7 +144,7 @@ def _mesh(place: Node, shape: mi.Mesh, name: str, assets: Assets) -> None:
         raise UnsupportedError(f"{_cannot(name)}: of '{place.plugin}' a mesh file does not say everything")
     kept = {key: v for key, v in place.entries.items() if isinstance(v, (Node, Reference)) or key in KEPT}
     place.plugin = "ply"
-    place.entries = {FILE: assets.add(f"{shape.id()}.ply", files.mesh(shape)), **kept}
+    place.entries = {FILE: assets.add(f"{shape.id() or name.rpartition('.')[0]}.ply", files.mesh(shape)), **kept}
 
 
 def _picture(place: Node, name: str, value: Any, assets: Assets) -> None:

@@ -29,7 +29,7 @@ class EventFiles:
         except ImportError as error:
             raise SetupError(
                 f"files for TensorBoard need the package tensorboardX ('{error.name}' is missing): pip install "
-                "'mitsuba-psdr[tensorboard]'"
+                "tensorboardX"
             ) from error
         folder = Path(folder)
         if folder.exists() and not folder.is_dir():

@@ -249,7 +249,7 @@ def _values(problem: Any) -> dict[str, bytes]:
             values[part.label(name, ":")] = _value(name, part.params[name])
             node = part.params.properties[name][2]
             if name.endswith(VERTEX_POSITIONS) and isinstance(node, mi.Mesh):
-                found[f"{part.label(node.id())}.ply"] = assets.mesh(node)
+                assets.add_file(found, f"{part.label(node.id() or name.rpartition('.')[0])}.ply", assets.mesh(node))
     content = io.BytesIO()
     np.savez(content, **values)
     return {"final.npz": content.getvalue(), **found}

@@ -36,7 +36,7 @@ def require_rerun() -> Any:
         import rerun
     except ImportError as error:
         raise SetupError(
-            f"the live view needs the package rerun-sdk ('{error.name}' is missing): pip install 'mitsuba-psdr[rerun]'"
+            f"the live view needs the package rerun-sdk ('{error.name}' is missing): pip install rerun-sdk"
         ) from error
     return rerun
 

@@ -133,8 +133,8 @@ def require_folder(folder: Path | None, resume: bool, mine: bool = False) -> Non
         checkpoints.require(folder / checkpoints.NAME)
     if not resume and folder is not None and (folder / checkpoints.NAME).exists():
         raise OptionError(
-            f"'{folder}' holds an earlier run: go on with it by resuming (--resume), choose another folder (--out), or "
-            "remove it"
+            f"'{folder}' holds an earlier run: go on with it (resume=True, --resume), choose another folder (out=..., "
+            "--out), or remove it"
         )
 
 

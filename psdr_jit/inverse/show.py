@@ -31,7 +31,7 @@ def result_png(result: Any) -> bytes:
 def result_html(result: Any) -> str:
     """Losses, offsets at the start and at the end, and before, after, target if the run has a folder."""
     good = {"finished": True, "diverged": False}.get(result.status)
-    about = f"{result.iterations} iterations, {result.seconds:.1f} s · loss {result.loss:.3e} (mean of the last)"
+    about = f"{result.iterations} iterations, {result.seconds:.1f} s · loss {result.loss:.3e} (mean of the last ones)"
     rows = [(name, kind, f"{result.start_offsets[name][kind]:.4g}", f"{value:.4g}")
             for name, now in result.offsets.items() for kind, value in now.items()]  # fmt: skip
     parts = [markup.badge(result.status, good)]

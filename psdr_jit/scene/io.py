@@ -42,7 +42,7 @@ def use_variant(name: str) -> None:
     except (ImportError, RuntimeError) as error:
         if (getattr(error, "name", None) or "").startswith("psdr_jit"):
             raise   # a module of ours is missing: a defect, not a matter of set-up
-        raise SetupError(f"variant '{name}' does not start: {error}. "
+        raise SetupError(f"variant '{name}' does not start: {str(error).rstrip('. ')}. "
                          "'psdr doctor' says what is missing") from error
 
 
@@ -66,7 +66,8 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
                              ) from error  # fmt: skip
         by_mesh = not text or "shape plugin" in text or isinstance(error, UnicodeDecodeError)
         if by_mesh and meshes and not any(mesh in text for mesh in meshes):
-            text += f" Is one of its mesh files empty or corrupt: {_suspects(meshes, text)}?"
+            fault = "missing" if "file not found" in text else "empty or corrupt"
+            text = f"{text.rstrip('. ')}. Is one of its mesh files {fault}: {_suspects(meshes, text)}?"
         raise SceneError(f"scene file '{path}' cannot be loaded: {text}") from error
     if not isinstance(scene, mi.Scene):
         raise SceneError(f"scene file '{path}' holds a {type(scene).__name__}, not a scene: "

@@ -14,6 +14,7 @@ from psdr_jit.derivative.finite_differences import CentralDifference
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import GroupedImages, block_means, block_test, gain
 from psdr_jit.derivative.verdict import FAIL, INCONCLUSIVE, PASS, judge
+from psdr_jit.errors import UnsupportedError
 from psdr_jit.scene import io as scene_io
 
 SHAPE = (32, 32, 3)
@@ -193,3 +194,14 @@ def test_a_failure_is_not_believed_before_a_smaller_step_was_tried(hurry):
                             spp=16, reference_spp=2048, max_seconds=limit, progress=linger)  # fmt: skip
     assert FAIL in said
     assert result.verdict.verdict == (INCONCLUSIVE if hurry else PASS), str(result)
+
+
+def test_a_check_through_an_irradiance_meter_is_refused_by_name(llvm):
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    scene = mi.load_dict({
+        "type": "scene", "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])},
+        "floor": {"type": "rectangle", "sensor": {"type": "irradiancemeter", "film": film}},
+        "sky": {"type": "constant"},
+    }, optimize=False)  # fmt: skip
+    with pytest.raises(UnsupportedError, match="irradiancemeter"):
+        check_gradient(scene, "cube.vertex_positions", (1, 0, 0), max_seconds=1)

@@ -42,7 +42,7 @@ for make in (psdr_jit.LiveView, psdr_jit.EventFiles):
     try:
         make("a.rrd")
     except psdr_jit.errors.SetupError as error:
-        assert "pip install 'mitsuba-psdr[" in str(error)
+        assert "pip install " in str(error)
     else:
         raise AssertionError(make)
 """

@@ -177,3 +177,12 @@ def test_spectral_variants_are_refused_with_the_way_out(llvm, tmp_path, name):
             write_scene(scene, tmp_path / "out.xml", source)
     finally:
         mi.set_variant("llvm_ad_rgb")
+
+
+def test_meshes_without_an_id_have_files_of_their_own():
+    from psdr_jit.export.assets import add_file
+
+    contents: dict = {}
+    names = [add_file(contents, name, content) for name, content in (
+        ("shape[1].ply", b"a"), ("shape[1].ply", b"b"), ("a b/c.ply", b"c"), (".ply", b"d"))]  # fmt: skip
+    assert names == ["shape_1.ply", "shape_1_1.ply", "a_b_c.ply", "file.ply"] and len(contents) == 4
