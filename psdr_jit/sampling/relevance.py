@@ -27,6 +27,7 @@ from ..edges.wedges import Wedges
 from ..plan.job import Job
 from .directions import pdf_view, sample_view
 from .mirror_images import SeenBall, SeenBalls, with_images
+from .nearness import nearness
 from .rows import ROW_SAMPLER, SampledRows, row_state
 
 #: Share of the samples on edges of resting shapes while only shapes move.
@@ -121,7 +122,9 @@ def secondary_edges(job: Job, term: str, use: Use) -> SecondaryEdges | None:
 def line_weights(job: Job, use: Use) -> list[mi.Float]:
     """By kind of edge, the relative weight of each row for lines anywhere in the scene."""
     table, movers = scene_edges(job), movers_of(job, use)
-    weights = table.weights(lambda kind: kind.line_weights(use))
+    weights, near = table.weights(lambda kind: kind.line_weights(use)), nearness(job)
+    if near is not None:
+        weights = [w * n for w, n in zip(weights, near, strict=True)]
     lights = light_bounds(job) if use is Use.SHADOW else None
     if lights is not None:
         casts = table.weights(lambda kind: kind.casts_shadow(lights, job.scene.bbox()))
