@@ -15,7 +15,7 @@ lanes that are not `active` may hold any row and are ignored.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import ClassVar, Protocol
 
@@ -96,6 +96,8 @@ class Side:
     traced: mi.Bool  # `pi` is still to be found by tracing `ray`
     own: mi.Bool  # a surface that moves as the edge does: relative to it, the edge rests
     differs: mi.Bool  # the two sides may differ at all
+    aside: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # farther off, where others are next to it, ...
+    shape: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # ... than this one: its registry index
 
     @staticmethod
     def found_by(ray: mi.Ray3f, own: mi.Bool | bool = False) -> Side:

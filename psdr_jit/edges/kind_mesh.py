@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -95,8 +95,8 @@ class MeshEdges(BetweenFaces):
         """Adjacent faces are found by topology, never by shooting at them: a face seen nearly edge-on is narrower than
         any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp) (`face_sides`); two faces
         on the same side are a silhouette, of which the one nearer to the viewer is seen. A face seen edge-on is on
-        neither side: the other face, if there is one, then ends at a silhouette. What silhouettes hide is looked at
-        clear of where Mitsuba starts rays (`step_past_lift`).
+        neither side: the other face, if there is one, then ends at a silhouette. What silhouettes hide right behind
+        them is looked at clear of where Mitsuba starts rays (`step_past_lift`).
         """
         rows = dr.gather(EdgeRows, self.rows, row, active)
         τ = dr.normalize(rows.p1 - rows.p0)
@@ -111,13 +111,15 @@ class MeshEdges(BetweenFaces):
         use1 = on1 & (~on0 | nearer1)
         face = (on0 | on1) & ~rows.traced
         pi = self._face(rows, use1, sight, face & active)
-        past = step_past_lift(sight.at.x, sight.offset, sight.r)
-        outline = silhouette & ~rows.traced
-        beside = replace(sight, offset=dr.select(outline, past, sight.offset)).beside(which)
+        beside = sight.beside(which)
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
+        past = step_past_lift(sight.at.x, sight.offset, sight.r) - sight.offset
+        aside = dr.select(silhouette & ~rows.traced & ~face, towards * past * sight.n_perp, 0)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
-        return Side(ray, pi, ~face, own, in_view & (rows.border | silhouette | rows.seam) | rows.traced)
+        differs = in_view & (rows.border | silhouette | rows.seam) | rows.traced
+        shape = dr.reinterpret_array(mi.UInt32, dr.gather(mi.ShapePtr, self.shapes, rows.shape0, active))
+        return Side(ray, pi, ~face, own, differs, aside, shape)
 
     def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
         """Onto the other face where one of two is seen edge-on, past both of an outline where one is nearly so; the

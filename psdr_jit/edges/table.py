@@ -12,8 +12,12 @@ import mitsuba as mi
 from .contact_limits import Touching
 from .kind import EdgeKind, OnEdge, Side, Sight
 from .location import EdgeLocation
+from .points import clear_of_lift
 
 T = TypeVar("T")
+
+#: Distance behind an outline up to which what it hides is looked at from farther aside, in heights at which rays start.
+NEXT_TO_OUTLINE = 100.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def look_beside(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt3
     `differs` is False where both sides are certainly alike.
     """
     side = table.side(sight, which)
-    ray, pi = _traced(scene, side, side.differs, wavelengths)
+    ray, pi = traced(scene, side, sight, side.differs, wavelengths)
     return ray, pi, side.differs
 
 
@@ -98,14 +102,24 @@ def look_behind(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt3
     """
     side = table.side(sight, which)
     wanted = side.differs & ~side.own
-    ray, pi = _traced(scene, side, wanted, wavelengths)
+    ray, pi = traced(scene, side, sight, wanted, wavelengths)
     pi.valid = pi.valid & wanted
     beyond = dr.dot(ray.o + pi.t * ray.d - sight.at.x, ray.d)
     return ray, pi, dr.select(side.traced, dr.maximum(beyond, 0), 0)
 
 
-def _traced(scene: mi.Scene, side: Side, wanted: mi.Bool, wavelengths):
-    ray = side.ray
+def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengths):
+    """What lies on a side: `(ray, pi)`, traced where `wanted`.
+
+    Another shape next to an outline is looked at once more, from farther aside: rays that start there must be clear
+    of the shape. Nothing else is, for that far aside the next fold of the shape may have ended as well.
+    """
+    ray, asked = side.ray, side.traced & wanted
     ray.wavelengths = wavelengths
-    found = scene.ray_intersect_preliminary(ray, coherent=False, active=side.traced & wanted)
+    found = scene.ray_intersect_preliminary(ray, coherent=False, active=asked)
+    beyond = dr.dot(ray.o + found.t * ray.d - sight.at.x, ray.d)
+    again = asked & found.is_valid() & (beyond < NEXT_TO_OUTLINE * clear_of_lift(sight.at.x)) & dr.any(side.aside != 0)
+    again &= dr.reinterpret_array(mi.UInt32, found.shape) != side.shape
+    ray.o = dr.select(again, ray.o + side.aside, ray.o)
+    found = dr.select(again, scene.ray_intersect_preliminary(ray, coherent=False, active=again), found)
     return ray, dr.select(side.traced, found, side.pi)

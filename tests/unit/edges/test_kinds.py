@@ -28,6 +28,7 @@ from psdr_jit.edges.kind_rod import RodEdges
 from psdr_jit.edges.kind_shading import ShadingOutlines
 from psdr_jit.edges.kind_tube import TubeOutlines
 from psdr_jit.edges.scene_table import scene_edges
+from psdr_jit.edges.table import traced
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
 from psdr_jit.scene.tubes import tubes_of
@@ -229,10 +230,11 @@ def cut_ball(ball, places: str, base: type) -> tuple[mi.Scene, EdgeKind]:
     return scene, kind
 
 
-def starts_behind(scene: mi.Scene, side, active) -> np.ndarray:
+def starts_behind(scene: mi.Scene, side, sight: Sight, active) -> np.ndarray:
     """Distance from the origin at which rays start from what `side` meets on the wall's front (N,)."""
-    si = scene.ray_intersect(side.ray, active)
-    met = np.array(si.is_valid() & (dr.dot(si.n, side.ray.d) < 0))
+    ray, pi = traced(scene, side, sight, active, [])
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    met = np.array(active & si.is_valid() & (dr.dot(si.n, ray.d) < 0))
     return np.array(dr.norm(si.spawn_ray(si.n).o))[met]
 
 
@@ -242,7 +244,7 @@ def test_rays_from_what_an_outline_hides_start_outside_of_the_shape(llvm):
     row, t, rng = rows_of(kind)
     on, ω = lines(kind, row, t, rng)
     sight = Sight.of(on, row, t, ω, mi.Float(DISTANCE), on.across(ω)[0])
-    start = starts_behind(scene, kind.side(row, sight, mi.UInt32(1), on.valid), on.valid)
+    start = starts_behind(scene, kind.side(row, sight, mi.UInt32(1), on.valid), sight, on.valid)
     assert len(start) > COUNT / 100 and (start > RADIUS).all()
 
 
@@ -260,6 +262,6 @@ def test_rays_from_what_a_fine_mesh_hides_start_outside_of_it(llvm):
     on = kind.on(row, t, mi.Vector4f(-ω.x, -ω.y, -ω.z, 0), pdf > 0)
     sight = Sight.of(on, row, t, ω, mi.Float(DISTANCE), on.across(ω)[0])
     sides = [kind.side(row, sight, mi.UInt32(which), on.valid) for which in (0, 1)]
-    start = np.concatenate([starts_behind(scene, side, on.valid & side.traced & side.differs) for side in sides])
+    start = np.concatenate([starts_behind(scene, side, sight, on.valid & side.traced & side.differs) for side in sides])
     inside = RADIUS * np.cos(np.pi / (2 * segments)) ** 2  # where the facets are nearest to the centre
     assert len(start) > count / 100 and (start > inside).all()
