@@ -9,7 +9,7 @@ from ..paths.rays import ROUNDING
 
 #: Sideways distance at which a ray that passes an edge is traced, relative to the distance from the scene's centre: far
 #: below anything one can see.
-SIDE_OFFSET = 1e-5
+SIDE_OFFSET = 3e-6
 
 #: The side rays start this many side offsets in front of the edge: an edge that rests on another surface is then
 #: seen against that surface, and the ray does not start beneath it.
