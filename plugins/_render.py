@@ -95,8 +95,8 @@ class TermIntegrator(ADIntegrator):
         with alone(), leftovers_named():
             prepared = self._prepared(call)
             with tangents_arrived(call.scene, call.sensor, prepared.facts):
-                if prepared.moving is not None:
-                    prepared.moving.take_tangents()
+                for moving in prepared.moving:
+                    moving.take_tangents()
                 images = {term.name: term.forward(job) for term, job in prepared.jobs}
                 prepared.observe(call.seed, images)
                 return self.aovs.forward(call, prepared, sum(images.values(), films.black(call.film)))
@@ -121,8 +121,8 @@ class TermIntegrator(ADIntegrator):
             grad_in = self.aovs.backward(call, prepared, grad_in)
             for term, job in prepared.jobs:
                 term.backward(job, grad_in)
-            if prepared.moving is not None:
-                prepared.moving.hand_on()
+            for moving in prepared.moving:
+                moving.hand_on()
             dr.eval()
 
     def sample(self, mode, scene, sampler, ray, *args, **kwargs):

@@ -24,7 +24,7 @@ from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
-from ..plan.job import Job, moving_meshes, tubes_of_call
+from ..plan.job import Job, in_motion, tubes_of_call
 from ..plan.light_plan import plan_light
 from ..plan.motion import Motion, SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
@@ -34,7 +34,7 @@ from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
 from ..scene.clipping import warn_about_clipping
 from ..scene.facts import SceneFacts, analyse
-from ..scene.mesh_tables import Moving
+from ..scene.mesh_tables import CallVariables
 from ..scene.painted_lights import warn_about_painted_lights
 from ..scene.stale_values import warn_about_stale_values
 from ..scene.tangent_facts import facts_along_tangents
@@ -65,7 +65,7 @@ class Prepared:
     jobs: list[tuple[Term, Job]]
     log: NoiseLog | None  # wants to see the derivative images of forward mode
     plain: Callable[[int], Job]  # the job of what is no term: so many paths per pixel, spread evenly
-    moving: Moving | None  # variables in place of vertices that move, for as long as the call lasts
+    moving: list[CallVariables]  # variables in place of what moves, for as long as the call lasts
 
     def observe(self, seed: object, images: Mapping[str, mi.TensorXf]) -> None:
         """Hand over the images of all terms."""
@@ -133,7 +133,7 @@ def prepare(call: Call) -> Prepared:
     listens = log is not None and question.automatic  # in every call: others would need kernels of their own
     tallies = {t.name: log.heard(plan.form, t.name) if listens else None for t in plan.running}
     jobs = [(by_name[t.name], question.job(plan, t.spp, t, tallies[t.name])) for t in plan.running]
-    return Prepared(plan, facts, jobs, log, lambda spp: question.job(plan, spp), moving_meshes(question.shared))
+    return Prepared(plan, facts, jobs, log, lambda spp: question.job(plan, spp), in_motion(question.shared))
 
 
 def _require_unfrozen() -> None:

@@ -17,22 +17,14 @@ ANY_TRIANGLE = ((0, 0, 0), (1, 0, 0), (0, 1, 0))
 
 
 def mesh_surface(
-    tables: MeshTables,
-    pi: mi.PreliminaryIntersection3f,
-    ray: mi.Ray3f,
-    flags: mi.RayFlags,
-    active: mi.Bool | bool = True,
-) -> mi.SurfaceInteraction3f:
-    """`pi.compute_surface_interaction(ray, flags, active)` in a scene of meshes. `flags`: with `FollowShape` or
-    without; not for derivatives of normals by texture coordinates (`dNSdUV`), nor for resting shapes (`DetachShape`).
-    """
+    tables: MeshTables, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags: mi.RayFlags, active: mi.Bool
+) -> dict:
+    """What meshes say of their surface where `active`, by field; anything finite elsewhere."""
     follow, frames, charts = (int(flags) & int(flag) != 0 for flag in (
         mi.RayFlags.FollowShape, mi.RayFlags.ShadingFrame, mi.RayFlags.UV | mi.RayFlags.dPdUV))  # fmt: skip
-    shape = dr.reinterpret_array(mi.UInt32, pi.shape)
-    hit = mi.Bool(active) & pi.is_valid()
-    corners = _Corners(tables, pi, shape, hit)
+    corners = _Corners(tables, pi, active)
     of_mesh = corners.of("positions", mi.Point3f)
-    p = [dr.select(hit, x, mi.Point3f(*other)) for x, other in zip(of_mesh, ANY_TRIANGLE, strict=True)]
+    p = [dr.select(active, x, mi.Point3f(*other)) for x, other in zip(of_mesh, ANY_TRIANGLE, strict=True)]
     e1, e2 = p[1] - p[0], p[2] - p[0]
     t, b = mi.Float(pi.t), mi.Point2f(pi.prim_uv)
     if not follow and dr.grad_enabled(p, ray.o, ray.d):
@@ -47,20 +39,8 @@ def mesh_surface(
         blended = mi.Vector3f(_blend(corners.of("normals", mi.Normal3f, smooth), b))
         shading = dr.select(smooth, dr.normalize(dr.select(smooth, blended, n)), n)
     outward = dr.select(corners.has(FLIPPED), mi.Float(-1), mi.Float(1))
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    values = {"p": x, "n": mi.Normal3f(n * outward), "uv": mi.Point2f(uv), "dp_du": dp_du, "dp_dv": dp_dv}
-    for name, value in values.items():
-        setattr(si, name, dr.select(hit, value, 0))
-    si.t = dr.select(hit, t, dr.inf)
-    si.shape = dr.reinterpret_array(mi.ShapePtr, dr.select(hit, shape, 0))
-    si.prim_index = mi.UInt32(pi.prim_index)
-    si.time, si.wavelengths = ray.time, ray.wavelengths
-    si.sh_frame.n = dr.select(hit, mi.Normal3f(shading * outward), 0)
-    if frames:
-        si.sh_frame.s = _along(si.sh_frame.n, si.dp_du)
-        si.sh_frame.t = dr.cross(si.sh_frame.n, si.sh_frame.s)
-    si.wi = dr.select(hit, si.to_local(-ray.d), -ray.d)
-    return si
+    return {"t": t, "p": x, "n": mi.Normal3f(n * outward), "uv": mi.Point2f(uv), "dp_du": dp_du, "dp_dv": dp_dv,
+            "shading": mi.Normal3f(shading * outward)}  # fmt: skip
 
 
 def _blend(corners: list, b: mi.Point2f):
@@ -71,8 +51,9 @@ def _blend(corners: list, b: mi.Point2f):
 class _Corners:
     """Where the corners of the triangles that were met are found, and what is known of their meshes."""
 
-    def __init__(self, tables: MeshTables, pi: mi.PreliminaryIntersection3f, shape: mi.UInt32, hit: mi.Bool):
+    def __init__(self, tables: MeshTables, pi: mi.PreliminaryIntersection3f, hit: mi.Bool):
         self._tables, self._hit = tables, hit
+        shape = dr.reinterpret_array(mi.UInt32, pi.shape)
         self._traits = dr.gather(mi.UInt32, tables.traits, shape, hit)
         face = dr.gather(mi.UInt32, tables.first_face, shape, hit) + pi.prim_index
         vertices = dr.gather(mi.Vector3u, tables.faces, face, hit)
@@ -121,10 +102,3 @@ def _charted(
     dp_du = dr.select(spans, (c.y * e1 - a.y * e2) * scale, s)
     dp_dv = dr.select(spans, (a.x * e2 - c.x * e1) * scale, t)
     return dr.select(textured, _blend(uv, b), b), dr.select(textured, dp_du, e1), dr.select(textured, dp_dv, e2)
-
-
-def _along(n: mi.Normal3f, dp_du: mi.Vector3f) -> mi.Vector3f:
-    """The unit vector at right angles to n that is next to ∂p/∂u; any one where that is 0."""
-    unknown = dr.all(dp_du == 0)
-    across = dr.select(unknown, mi.Vector3f(1, 0, 0), dr.fma(n, -dr.dot(n, dp_du), dp_du))
-    return dr.select(unknown, mi.coordinate_system(n)[0], dr.normalize(across))

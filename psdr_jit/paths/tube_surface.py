@@ -22,9 +22,9 @@ from ..scene.tubes import Splines, Tubes
 from .cylinder_surface import cylinder_surface
 from .ellipsoid_surface import ellipsoid_surface
 from .grid_surface import grid_surface
-from .mesh_surface import mesh_surface
 from .own_surface import of_hit, on_ray, where_active
 from .rod_surface import rod_surface
+from .tabled_surface import tabled_surface
 
 
 def surface_at(
@@ -37,7 +37,7 @@ def surface_at(
     if tubes is None:
         return pi.compute_surface_interaction(ray, flags, active)
     if tubes.meshes is not None:
-        return mesh_surface(tubes.meshes, pi, ray, flags, active)
+        return tabled_surface(tubes.meshes, pi, ray, flags, active)
     families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
     families += [(grid, grid_surface) for grid in tubes.grids]
     follow = int(flags) & int(mi.RayFlags.FollowShape) != 0

@@ -23,7 +23,7 @@ from ..paths.orbits import Orbits
 from ..paths.rough_plastic import RoughPlastic, rough_plastic
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
-from ..scene.mesh_tables import Moving
+from ..scene.mesh_tables import CallVariables
 from ..scene.tubes import Tubes, tubes_of
 from .call import Call
 from .light_plan import light_technique
@@ -163,10 +163,10 @@ def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None
     return shared.once(TUBES, lambda: tubes_of(call.scene, facts, call.memory))
 
 
-def moving_meshes(shared: Memory) -> Moving | None:
-    """Variables that stand for the vertices of what moves, in what the terms of a render call share."""
+def in_motion(shared: Memory) -> list[CallVariables]:
+    """Variables that stand for what moves, in what the terms of a render call share."""
     tubes = shared[TUBES]
-    return None if tubes is None or tubes.meshes is None else tubes.meshes.moving
+    return [] if tubes is None or tubes.meshes is None else tubes.meshes.in_motion()
 
 
 def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +26,7 @@ from ..core.joining import joined
 from ..core.memory import Memory, Slot, while_unchanged
 from ..core.upload import uploaded
 from ..core.varying import varying
+from .sphere_table import SphereTable, is_sphere, sphere_table
 
 #: What is known of a shape; bits of `MeshTables.traits`.
 SMOOTH, TEXTURED, FLIPPED, MOVES = (1 << k for k in range(4))
@@ -40,6 +42,16 @@ class Vertices:
     positions: mi.Float
     normals: mi.Float
     texcoords: mi.Float
+
+
+class CallVariables(Protocol):
+    """Variables that stand for arrays of Mitsuba's while a render call lasts."""
+
+    def take_tangents(self) -> None:
+        """Give them the tangents of Mitsuba's arrays: before the terms run in forward mode."""
+
+    def hand_on(self) -> None:
+        """Add their gradients to those of Mitsuba's arrays: after the terms have run in backward mode."""
 
 
 FIELDS = tuple(field.name for field in fields(Vertices))
@@ -76,7 +88,7 @@ class Moving:
 
 @dataclass(frozen=True)
 class MeshTables:
-    """The meshes of a scene that has no other shapes, by registry index; and their vertices. Detached but for `moving`.
+    """The meshes of a scene of meshes and spheres, by registry index; and their vertices. Detached but for what moves.
     """
 
     traits: mi.UInt32  # what is known of it
@@ -87,17 +99,25 @@ class MeshTables:
     moving: Moving | None
     smooth: bool  # do some have vertex normals?
     textured: bool  # do some have texture coordinates?
+    spheres: SphereTable | None = None
+
+    def in_motion(self) -> list[CallVariables]:
+        """What has variables that take over tangents, and hand on gradients."""
+        spheres = self.spheres is not None and self.spheres.moving
+        return [*([self.moving] if self.moving is not None else []), *([self.spheres] if spheres else [])]
 
 
 def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
-    """The tables of a scene of meshes alone; None if there are other shapes.
+    """The tables of a scene of meshes and spheres; None if there are other shapes, or no meshes.
 
     They are made anew only when an array of a mesh that rests has been replaced.
     """
-    meshes = scene.shapes()
-    if not meshes or not all(shape.is_mesh() for shape in meshes):
+    shapes = scene.shapes()
+    meshes = [shape for shape in shapes if shape.is_mesh()]
+    if not meshes or not all(shape.is_mesh() or is_sphere(shape) for shape in shapes):
         return None
-    ids = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    every = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    ids = every[[shape.is_mesh() for shape in shapes]]
     with dr.resume_grad():
         moves = [dr.grad_enabled(_buffers(mesh)) for mesh in meshes]
         moving = _moving([mesh for mesh, own in zip(meshes, moves, strict=True) if own]) if any(moves) else None
@@ -106,8 +126,8 @@ def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
     arrays += [buffer for mesh, own in zip(meshes, moves, strict=True) if not own for buffer in _buffers(mesh)]
     with dr.suspend_grad():
         key = (*ids.tolist(), *traits)
-        tables = while_unchanged(memory[TABLES], key, arrays, lambda: _tables(meshes, ids, traits))
-    return replace(tables, moving=moving)
+        tables = while_unchanged(memory[TABLES], key, arrays, lambda: _tables(meshes, ids, traits, every.max() + 1))
+    return replace(tables, moving=moving, spheres=sphere_table(shapes, every, memory))
 
 
 def _traits(mesh: mi.Mesh) -> int:
@@ -147,8 +167,8 @@ def _moving(meshes: Sequence[mi.Mesh]) -> Moving:
     return Moving(sources, own)
 
 
-def _tables(meshes: Sequence[mi.Mesh], ids: np.ndarray, traits: Sequence[int]) -> MeshTables:
-    """Without what moves. `ids`: registry indices."""
+def _tables(meshes: Sequence[mi.Mesh], ids: np.ndarray, traits: Sequence[int], size: int) -> MeshTables:
+    """Without what moves, and spheres. `ids`: registry indices, below `size`."""
     vertices, faces = (np.array([count(mesh) for mesh in meshes])
                        for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))  # fmt: skip
     first_vertex, first_face = _first(vertices), _first(faces)
@@ -158,7 +178,7 @@ def _tables(meshes: Sequence[mi.Mesh], ids: np.ndarray, traits: Sequence[int]) -
     dr.eval(corners)
 
     def by_shape(values: np.ndarray) -> mi.UInt32:
-        table = np.zeros(ids.max() + 1, np.int64)
+        table = np.zeros(size, np.int64)
         table[ids] = values
         return uploaded(mi.UInt32, table.astype(np.uint32))  # differences below 0 wrap around, and back
 

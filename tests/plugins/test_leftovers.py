@@ -33,9 +33,9 @@ def detach_light(params: mi.SceneParameters) -> None:
 @pytest.mark.parametrize("same", [True, False], ids=["the same scene", "another scene"])
 def test_forward_mode_says_what_to_detach(llvm, same):
     """Dr.Jit's calls reach all scenes that are alive. Once it is detached, all is well."""
-    scene = shipped("ball_shadow")
+    scene = shipped("tube_shadow")
     params = attach_light(scene)
-    asked = scene if same else shipped("ball_shadow")
+    asked = scene if same else shipped("tube_shadow")
 
     def derivative():
         return psdr_jit.gradient(asked, MOVER, (1, 0, 0), spp=1, seeds=1)

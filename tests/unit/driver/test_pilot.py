@@ -133,8 +133,8 @@ def test_the_probe_is_the_derivative_along_its_motion(llvm, form, scene_name, pa
     motion.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)
     prepared = prepare(integrator.call(scene, scene.sensors()[0], 1, 4))
-    if prepared.moving is not None:
-        prepared.moving.take_tangents()
+    for moving in prepared.moving:
+        moving.take_tangents()
     for term, job in prepared.jobs:
         expected = np.array(term.forward(job))
         scale = np.abs(expected).max()

@@ -164,8 +164,8 @@ def test_everything_shifted_shifts_the_edge(found):
     dr.forward(θ, dr.ADFlag.ClearEdges)
     if isinstance(kind, Junctions):  # what it knows of meshes is of a call in which nothing moves
         kind = replace(kind, tubes=tubes_of(job.scene, job.facts, Memory()))
-        if kind.tubes.meshes is not None:
-            kind.tubes.meshes.moving.take_tangents()
+        for moving in kind.tubes.meshes.in_motion() if kind.tubes is not None else ():
+            moving.take_tangents()
     motion = kind.displacement(row, sight.at, sight.ω, mi.Bool(True))
     assert np.abs(np.array(motion)).max() == 0
     speed = dr.dot(n_perp, tangents(motion))
