@@ -31,6 +31,11 @@ from .sphere_table import SphereTable, is_sphere, sphere_table
 #: What is known of a shape; bits of `MeshTables.traits`.
 SMOOTH, TEXTURED, FLIPPED, MOVES = (1 << k for k in range(4))
 
+#: Shapes from which on tables cost less than calls. Kernels of three take up to a tenth longer with them, of ten a
+#: twentieth less; what is recorded, and so the time outside of kernels and that of compiling them, grows with every
+#: shape that a call knows.
+FEWEST = 6
+
 #: Of an integrator: the tables of meshes that rest.
 TABLES: Slot[dict] = Slot(dict)
 
@@ -108,13 +113,13 @@ class MeshTables:
 
 
 def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
-    """The tables of a scene of meshes and spheres; None if there are other shapes, or no meshes.
+    """The tables of a scene of meshes and spheres; None if there are other shapes, no meshes, or few of them.
 
     They are made anew only when an array of a mesh that rests has been replaced.
     """
     shapes = scene.shapes()
     meshes = [shape for shape in shapes if shape.is_mesh()]
-    if not meshes or not all(shape.is_mesh() or is_sphere(shape) for shape in shapes):
+    if len(shapes) < FEWEST or not meshes or not all(shape.is_mesh() or is_sphere(shape) for shape in shapes):
         return None
     every = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
     ids = every[[shape.is_mesh() for shape in shapes]]
