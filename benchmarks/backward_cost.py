@@ -3,8 +3,8 @@
     python -m benchmarks.backward_cost                  (minutes; append to benchmarks/results/backward_cost.jsonl)
     python -m benchmarks.backward_cost --out -          (print the rows instead)
 
-The Cornell box, its small box's vertices enabled. The methods take turns within each round, so that a slow spell of
-the machine hits all of them; the first rounds warm up caches and are dropped.
+The Cornell box, its small box's vertices enabled, and a crowd of boxes, those of one. The methods take turns within each
+round, so that a slow spell of the machine hits all of them; the first rounds warm up caches and are dropped.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ PARAMETER = "small-box.vertex_positions"
 PATHS = {"max_depth": 4, "rr_depth": 100}
 LIFT = 0.06  # of the small box above the floor [scene units] in the placement "floating"
 WARM_UP = 2  # rounds
+CROWD = 100  # boxes
 QUIET = 0.5  # load average above which other processes disturb the measurement
 
 METHODS = {
@@ -55,10 +56,27 @@ def load(placement: str, res: int) -> Any:
     return scene
 
 
-def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], Any]]]:
+def crowd(res: int) -> Any:
+    """A hundred boxes on a floor under a lamp: what every further shape costs."""
+    rng, T = np.random.default_rng(0), mi.ScalarTransform4f()
+    film = {"type": "hdrfilm", "width": res, "height": res}
+    look = T.look_at([0, -8, 5], [0, 0, 0], [0, 0, 1])
+    boxes = {
+        f"box{k}": {"type": "cube", "to_world": T.translate([*rng.uniform(-3, 3, 2), 0.15]).scale(0.1)}
+        for k in range(CROWD)
+    }
+    return mi.load_dict({
+        "type": "scene", "sensor": {"type": "perspective", "to_world": look, "film": film}, **boxes,
+        "floor": {"type": "rectangle", "to_world": T.scale(10)},
+        "lamp": {"type": "rectangle", "to_world": T.translate([0, 0, 6]).rotate([1, 0, 0], 180),
+                 "emitter": {"type": "area", "radiance": 10.0}},
+    }, optimize=False)  # fmt: skip
+
+
+def runs(scene: Any, spp: int, parameter: str = PARAMETER) -> dict[str, Callable[[int], Callable[[], Any]]]:
     """For each method: seed -> the work to be timed, all else prepared."""
     params = mi.traverse(scene)
-    original = mi.Float(params[PARAMETER])
+    original = mi.Float(params[parameter])
     width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
     grad_in = dr.full(mi.TensorXf, 1 / (width * height), (height, width, 3))
     dr.eval(grad_in)
@@ -66,8 +84,8 @@ def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], Any]]]:
     def attach(enabled: bool) -> None:
         value = mi.Float(original)
         dr.set_grad_enabled(value, enabled)
-        params[PARAMETER] = value
-        params.set_dirty(PARAMETER)
+        params[parameter] = value
+        params.set_dirty(parameter)
         params.update()
         dr.eval()
 
@@ -84,7 +102,7 @@ def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], Any]]]:
 
             def work() -> Any:
                 integrator.render_backward(scene, params, grad_in, seed=seed, spp=spp)
-                return dr.grad(params[PARAMETER])
+                return dr.grad(params[parameter])
 
             return work
 
@@ -94,9 +112,9 @@ def runs(scene: Any, spp: int) -> dict[str, Callable[[int], Callable[[], Any]]]:
     return {name: (primal if "primal" in name else backward)(integrator) for name, integrator in built.items()}
 
 
-def timing_rows(res: int, spp: int, count: int) -> list[dict[str, Any]]:
-    """Cost of each method on the box in contact with the floor."""
-    work = runs(load("contact", res), spp)
+def timing_rows(case: str, scene: Any, parameter: str, spp: int, count: int) -> list[dict[str, Any]]:
+    """Cost of each method on a scene."""
+    work = runs(scene, spp, parameter)
     samples: dict[str, list[tuple[float, float, int]]] = {name: [] for name in work}
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for seed in range(WARM_UP + count):
@@ -104,12 +122,13 @@ def timing_rows(res: int, spp: int, count: int) -> list[dict[str, Any]]:
                 sample = measured(prepare(seed))
                 if seed >= WARM_UP:
                     samples[name].append(sample)
-    settings = {"res": res, "spp": spp, **PATHS, "parameter": PARAMETER, "warm_up": WARM_UP}
+    res = int(scene.sensors()[0].film().crop_size()[0])
+    settings = {"res": res, "spp": spp, **PATHS, "parameter": parameter, "warm_up": WARM_UP}
     seeds = list(range(WARM_UP, WARM_UP + count))
     found = []
     for name, taken in samples.items():
         wall, kernel, launches = (rows.summary(column) for column in zip(*taken, strict=True))
-        found.append({"bench": BENCH, "case": "cbox contact", "method": name, "settings": settings, "seeds": seeds,
+        found.append({"bench": BENCH, "case": case, "method": name, "settings": settings, "seeds": seeds,
                       "wall_ms": wall, "kernel_ms": kernel, "launches": launches["median"]})  # fmt: skip
     return found
 
@@ -141,7 +160,8 @@ def main() -> int:
     where = rows.circumstances()
     if where["load"] > QUIET:
         print(f"load average {where['load']:.1f} on {os.cpu_count()} cores: timings will be off", file=sys.stderr)
-    found = timing_rows(args.res, args.spp, args.runs)
+    found = timing_rows("cbox contact", load("contact", args.res), PARAMETER, args.spp, args.runs)
+    found += timing_rows(f"{CROWD} boxes", crowd(args.res // 2), "box0.vertex_positions", args.spp // 4, args.runs)
     found += [variance_row(p, args.res, args.variance_spp, args.variance_seeds) for p in ("contact", "floating")]
     for row in found:
         if args.out == "-":

@@ -27,7 +27,7 @@ def test_dask_is_loaded_only_when_it_is_asked_for():
 
 def test_its_absence_is_named_with_the_way_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SetupError, match=r"mitsuba-psdr\[cluster\]"), engine.local(2):
+    with pytest.raises(SetupError, match=r"pip install 'distributed"), engine.local(2):
         pass
 
 

@@ -50,9 +50,10 @@ def test_among_meshes_alone_another_scene_is_no_matter(llvm):
     """Their surfaces are asked for without a call: what is attached in another scene brings nothing."""
     params = attach_light(shipped("cbox"))
     ours = {"type": "psdr_path", "sppc": 16, "sppp": 16, "sppi": 16}
+    how = {"direction": (1, 0, 0), "seeds": 1, "integrator": ours}
 
     def derivative():
-        return psdr_jit.gradient(shipped("cbox"), "small-box.vertex_positions", (1, 0, 0), seeds=1, integrator=ours).total
+        return psdr_jit.gradient(shipped("cbox"), "small-box.vertex_positions", **how).total
 
     found = derivative()
     detach_light(params)
