@@ -3,7 +3,7 @@
     python -m benchmarks.backward_cost                  (minutes; append to benchmarks/results/backward_cost.jsonl)
     python -m benchmarks.backward_cost --out -          (print the rows instead)
 
-The Cornell box, its small box's vertices enabled, and a crowd of boxes, those of one. The methods take turns within each
+The Cornell box, its small box's vertices enabled, and a crowd of boxes, those of one. The methods take turns in each
 round, so that a slow spell of the machine hits all of them; the first rounds warm up caches and are dropped.
 """
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.compat import mesh_faces, mesh_positions
 from ..core.sensor_frame import origin_box
@@ -16,7 +17,7 @@ from ..plan.job import Job
 from ..scene.facts import EmitterFacts, ShapeFacts
 from .convexity import is_convex_body
 from .edge_shapes import edge_shapes
-from .overlaps import apart
+from .overlaps import apart, box_of
 from .rows import EdgeRows
 
 #: Faces of a body up to which edges are looked for inside of it: each edge is compared with each of its faces.
@@ -28,22 +29,30 @@ DEPTH, ROUNDING = 1e-4, 1e-6
 
 def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> mi.Bool | None:
     """Rows that lie inside of one of `bodies`. None if none of these can hide anything."""
-    found = None
+    found, shapes = None, edge_shapes(job).shapes
+    starts = [origin_box(job.frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
+    lonely = _lonely([box_of(shape) for shape in shapes])
     for body in bodies:
-        if _may_hide(job, body):
-            inside = _is_inside(edge_shapes(job).shapes[body.index], body, rows, job.facts.reach)
+        if not lonely[body.index] and _may_hide(job, body, starts):
+            inside = _is_inside(shapes[body.index], body, rows, job.facts.reach)
             found = inside if found is None else found | inside
             dr.eval(found)  # body by body in one kernel: together they would be one for every number of them
     return found
 
 
-def _may_hide(job: Job, body: ShapeFacts) -> bool:
-    """Is this a body that no path gets into?"""
+def _lonely(boxes: list[np.ndarray]) -> np.ndarray:
+    """By shape with such a bounding box: is it apart from all others?"""
+    lower, upper = np.stack(boxes, axis=1)
+    meets = ((lower[:, None] <= upper[None]) & (upper[:, None] >= lower[None])).all(-1)
+    return meets.sum(1) == 1
+
+
+def _may_hide(job: Job, body: ShapeFacts, starts: list[tuple]) -> bool:
+    """Is this a body that no path gets into? `starts`: boxes in which they begin."""
     shape = edge_shapes(job).shapes[body.index]
     small = body.plugin == "sphere" or (body.is_mesh and body.faces <= MAX_FACES)
     if not body.opaque or body.is_emitter or body.has_medium or not small:
         return False
-    starts = [origin_box(job.frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
     outside = all(apart(*start, shape.bbox()) for start in starts)
     return outside and is_convex_body(shape, body, job.call.memory)
 

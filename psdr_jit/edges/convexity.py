@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, same_values
-from ..core.memory import Memory, Slot, key_of
+from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer, same_values
+from ..core.memory import Memory, Slot, key_of, while_unchanged
 from ..core.sensor_frame import origin_box, sensor_frame
 from ..core.varying import varying
 from ..scene.capabilities import SUPPORTED_SENSORS
@@ -19,6 +19,8 @@ from .topology import build_edge_topology
 
 #: By name of a mesh: its faces, and whether they are one closed surface with its normals outward.
 CLOSED: Slot[dict[str | int, tuple[mi.UInt32, bool]]] = Slot(dict)
+#: Likewise: whether a closed one is convex, for as long as its arrays are the same.
+CONVEX: Slot[dict] = Slot(dict)
 
 #: Pairs of a face and a vertex up to which a mesh is looked at.
 MAX_PAIRS = 2**22
@@ -52,7 +54,10 @@ def is_convex_body(shape: mi.Shape, facts: ShapeFacts, memory: Memory) -> bool:
         return True
     if not facts.is_mesh or facts.faces * shape.vertex_count() > MAX_PAIRS:
         return False
-    return _is_closed(shape, memory) and _is_behind_its_faces(shape)
+    if not _is_closed(shape, memory):
+        return False
+    arrays = [positions_buffer(shape), faces_buffer(shape)]
+    return while_unchanged(memory[CONVEX], key_of(shape), arrays, lambda: _is_behind_its_faces(shape))
 
 
 def _is_closed(mesh: mi.Mesh, memory: Memory) -> bool:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.compat import normals_buffer
 from ..core.joining import joined, pointers
 from ..core.memory import Memory
 from ..core.upload import uploaded
@@ -79,10 +80,10 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
 
 def _normals(meshes: tuple[mi.Mesh, ...]) -> mi.Normal3f:
     """Shading normals of all vertices, attached."""
-    parts = [mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())) for mesh in meshes]
-    if len(parts) == 1:
-        return mi.Normal3f(parts[0])
-    return mi.Normal3f(*(joined([part[axis] for part in parts]) for axis in range(3)))
+    if len(meshes) == 1:
+        return mi.Normal3f(meshes[0].vertex_normal(dr.arange(mi.UInt32, meshes[0].vertex_count())))
+    flat = joined([normals_buffer(mesh) for mesh in meshes])
+    return dr.gather(mi.Normal3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
 
 
 def _gathered(positions: mi.Point3f, normals: mi.Normal3f, corner: mi.Vector3u, active: mi.Bool):
