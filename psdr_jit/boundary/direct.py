@@ -37,7 +37,7 @@ from ..edges.location import EdgeLocation
 from ..edges.points import LEAST_SLANT, start_height
 from ..options import Options
 from ..paths.smooth_lights import has_smooth_lights
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
 from ..plan.motion import Displacements
@@ -51,7 +51,7 @@ from ..sampling.light_steps import light_step_weights
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
-from ..scene.tubes import Tubes
+from ..scene.surfaces import Surfaces
 from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
@@ -143,7 +143,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     # A contour's own surface may begin within its lead.
     active &= pd.is_valid() & (r > dr.select(on.aside > 0, on.offset, on.lead))
     if any(kind.surfaces_meet for kind in edges.table.kinds):
-        active &= ~thinner_than_lift(scene, job.tubes, pd, down, active)
+        active &= ~thinner_than_lift(scene, job.surfaces, pd, down, active)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     segment = BoundarySegment(
@@ -164,13 +164,13 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     return compact(segment, active)
 
 
-def thinner_than_lift(scene: mi.Scene, tubes: Tubes | None, hit, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+def thinner_than_lift(scene: mi.Scene, surfaces: Surfaces | None, hit, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
     """Is the shadow that ends at `hit` too thin to be in the image, next to where two surfaces meet?
 
     Mitsuba starts rays a height h above surfaces. The line is met at that height by the ray of another receiver, whose
     place may lie beyond the curve where the surfaces meet: no receiver has this shadow then.
     """
-    si = surface_at(tubes, hit, ray, mi.RayFlags.Minimal, active)
+    si = surface_at(surfaces, hit, ray, mi.RayFlags.Minimal, active)
     facing = dr.dot(si.n, ray.d)
     n = dr.select(facing > 0, -si.n, si.n)
     height = start_height(si.p)

@@ -20,7 +20,7 @@ from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, Sight
 from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..paths.walk import walk
 from ..plan.job import Job
 from ..sampling.guided import guided
@@ -113,7 +113,7 @@ def lies_within(job: Job, x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray:
     It then meets a face of the edge itself, or one in line with it, where it should pass along. A mirror there would
     receive it with a weight of 1/(n·ω).
     """
-    si = surface_at(job.tubes, hit, ray, mi.RayFlags.Minimal, hit.is_valid())
+    si = surface_at(job.surfaces, hit, ray, mi.RayFlags.Minimal, hit.is_valid())
     return dr.abs(dr.dot(si.n, x - si.p)) <= ROUNDING * dr.max(dr.abs(x))
 
 

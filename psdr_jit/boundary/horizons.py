@@ -25,7 +25,7 @@ from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from ..sampling.horizons import SampledHorizons, sampled_horizons
 from ..sampling.rows import edge_samples
@@ -162,7 +162,7 @@ def trace_lights(job: Job, horizons: SampledHorizons, line: HorizonLine) -> LitH
         return None
     line, which, ray, pi = found.line, found.which, found.ray, found.pi
     on = line.on
-    si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
+    si = surface_at(job.surfaces, pi, ray, mi.RayFlags.All)
     emitter = si.emitter(job.scene)
     wanted = dr.gather(mi.UInt32, horizons.table.targets.emitter, on.target)
     met = dr.reinterpret_array(mi.UInt32, emitter)

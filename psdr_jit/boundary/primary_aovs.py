@@ -16,7 +16,7 @@ from ..core.ad import accumulate, backpropagate, tangents
 from ..edges.scene_table import scene_edges
 from ..edges.table import look_beside
 from ..paths.aovs import Aovs
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from ..sampling.film_edges import FilmEdges, film_edges, film_weights
 from . import primary
@@ -40,7 +40,7 @@ def _jumps(job: Job, aovs: Aovs, edges: FilmEdges, sample: primary.EdgeSample) -
     which, s = index & 1, dr.gather(primary.EdgeSample, sample, index >> 1)
     seen = primary.seen_edge(job, edges, s)
     ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, dr.zeros(mi.Color0f))
-    si = surface_at(job.tubes, pi, ray, mi.RayFlags.All, differs)
+    si = surface_at(job.surfaces, pi, ray, mi.RayFlags.All, differs)
     values = [dr.select(differs, value, 0) for value in aovs.values(si, seen.view.o)]
     dr.eval(values)
     even = 2 * dr.arange(mi.UInt32, n)

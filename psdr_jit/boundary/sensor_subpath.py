@@ -33,7 +33,7 @@ from ..edges.points import facing
 from ..paths.bounce import PathLimits, PathState, bounce, particle_eval
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.sensor_connection import on_film, seen_by_sensor
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from .awaited import Awaited
 from .delta_adjoint import DeltaRecords, DeltaTurn, carried_along, through_vertex
@@ -247,7 +247,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
     orbits = job.orbits
     waits = mi.Bool(False) if awaited is None else mi.Bool(receivers.waits)
     while dr.hint(active, label="psdr.sensor_walk", exclude=[job, limits, awaited, orbits]):
-        si = surface_at(job.tubes, pi, ray, mi.RayFlags.All)
+        si = surface_at(job.surfaces, pi, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         end = _connect(job, sampler, si, bsdf, value * path.β, active)
         if dr.hint(awaited is not None, mode="scalar"):

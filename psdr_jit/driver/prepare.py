@@ -24,7 +24,7 @@ from ..options import Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try
-from ..plan.job import Job, in_motion, tubes_of_call
+from ..plan.job import Job, in_motion, surfaces_of_call
 from ..plan.light_plan import plan_light
 from ..plan.motion import Motion, SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
@@ -89,9 +89,9 @@ class _Question:
 
     def job(self, plan: Plan, spp: int, term: TermPlan | None = None, tally: LineTally | None = None) -> Job:
         """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes. `tally`: listens."""
-        tubes = tubes_of_call(self.call, self.facts, self.shared)
+        surfaces = surfaces_of_call(self.call, self.facts, self.shared)
         film, lines = (None, None) if term is None else (term.film, term.lines)
-        motion = SceneMotion(self.call.sensor, tubes)
+        motion = SceneMotion(self.call.sensor, surfaces)
         # What a guide has learned from must be independent of what it draws, also if a seed comes back.
         call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
         probe = self.probe if tally is not None and call.mode == "backward" else None
@@ -101,8 +101,8 @@ class _Question:
     def probe(self) -> Motion:
         """The motion of everything that can move, found once per render call."""
         if self.shared[PROBE] is None:
-            tubes = tubes_of_call(self.call, self.facts, self.shared)
-            self.shared[PROBE] = probe_motion(self.call.scene, self.facts, tubes)
+            surfaces = surfaces_of_call(self.call, self.facts, self.shared)
+            self.shared[PROBE] = probe_motion(self.call.scene, self.facts, surfaces)
         return self.shared[PROBE]
 
 

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..paths.tube_surface import surface_at
-from ..scene.tubes import Tubes
+from ..paths.surface_at import surface_at
+from ..scene.surfaces import Surfaces
 from .junctions import JunctionRows, Sheet
 
 #: Length of the ray by which a point of a ball or cylinder is addressed, relative to its coordinates.
@@ -36,7 +36,7 @@ def _across(v: mi.Vector3f, axis: mi.Vector3f) -> mi.Vector3f:
 
 
 def junction_motion(
-    rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Point3f, tubes: Tubes | None, active
+    rows: JunctionRows, index: mi.UInt32, t: mi.Float, x: mi.Point3f, surfaces: Surfaces | None, active
 ) -> mi.Vector3f:
     """Vector of value 0 whose derivative is the velocity of the curve at x, attached to both surfaces."""
     sheets = [dr.gather(Sheet, sheet, index, active) for sheet in (rows.a, rows.b)]
@@ -44,17 +44,17 @@ def junction_motion(
         dr.select(s.is_round, dr.normalize(_across(mi.Vector3f(x - s.centre), s.axis)), mi.Vector3f(s.n))
         for s in sheets
     )
-    moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, tubes, active))
+    moved_a, moved_b = (dr.dot(n, _moved(s, n, t, x, surfaces, active))
                         for n, s in zip((n_a, n_b), sheets, strict=True))  # fmt: skip
     c = dr.dot(n_a, n_b)
     scale = dr.rcp(dr.squared_norm(dr.cross(n_a, n_b)))  # 1 − c² without cancellation
     return (n_a - c * n_b) * scale * moved_a + (n_b - c * n_a) * scale * moved_b
 
 
-def _moved(s: Sheet, n: mi.Vector3f, t: mi.Float, x: mi.Point3f, tubes: Tubes | None, active) -> mi.Vector3f:
+def _moved(s: Sheet, n: mi.Vector3f, t: mi.Float, x: mi.Point3f, surfaces: Surfaces | None, active) -> mi.Vector3f:
     """Attached displacement (value 0) of the material point of a surface at x."""
     height = PROBE * (1 + dr.max(dr.abs(x)))
     hit = Hit(x + height * n, -n, height, s.shape, s.prim, s.uv_start + t * (s.uv_end - s.uv_start))
     follow = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-    p = surface_at(tubes, hit.intersection(), mi.Ray3f(hit.o, hit.d), follow, active).p
+    p = surface_at(surfaces, hit.intersection(), mi.Ray3f(hit.o, hit.d), follow, active).p
     return p - dr.detach(p)

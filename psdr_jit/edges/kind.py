@@ -107,7 +107,7 @@ class Side:
 
     @staticmethod
     def of_segment(segments, segment: mi.UInt32, x: mi.Point3f, sight: Sight, which: mi.UInt32, own: mi.Bool) -> Side:
-        """The point `x` of a `segment` of curves or bodies (`scene.tubes`) where `own`; elsewhere found by tracing.
+        """The point `x` of a `segment` of curves or bodies (`scene.surfaces`) where `own`; elsewhere found by tracing.
 
         It is not shot at: what it looks like beside its edge is known better than a ray meets it.
         """

@@ -15,7 +15,7 @@ import mitsuba as mi
 from ..core.curve_frame import frame_turn, radial
 from ..core.rod import Rod
 from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
-from ..scene.tubes import Rods, Splines
+from ..scene.surfaces import Rods, Splines
 from .curve_pattern_rows import Part
 from .film_cover import LENS_CENTRE
 from .kind import OnEdge, Side, Sight

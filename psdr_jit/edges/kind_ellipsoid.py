@@ -13,7 +13,7 @@ from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..scene.names import shown_name
-from ..scene.tubes import Ellipsoids
+from ..scene.surfaces import Ellipsoids
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
 from .overlaps import crossing

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame
-from ..scene.tubes import Tubes
+from ..scene.surfaces import Surfaces
 from .film_cover import EdgeOnFilm, straight_cover
 from .junction_points import bend, junction_motion
 from .junctions import JunctionRows
@@ -35,7 +35,7 @@ class Junctions(BetweenFaces):
     index: mi.UInt32  # by row: entry of `curves`
     curves: JunctionRows
     centre: mi.Point3f  # of the scene
-    tubes: Tubes | None
+    surfaces: Surfaces | None
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Being behind one of the surfaces is enough to be hidden."""
@@ -100,4 +100,4 @@ class Junctions(BetweenFaces):
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         index = dr.gather(mi.UInt32, self.index, row, active)
-        return dr.select(active, junction_motion(self.curves, index, at.t, dr.detach(at.x), self.tubes, active), 0)
+        return dr.select(active, junction_motion(self.curves, index, at.t, dr.detach(at.x), self.surfaces, active), 0)

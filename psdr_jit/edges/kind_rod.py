@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..core.rod import Rod
 from ..core.rod_crease import crease
-from ..scene.tubes import NONE, Rods
+from ..scene.surfaces import NONE, Rods
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
 from .points import clearance

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.tube_axis import Axis
 from ..core.upload import uploaded
-from ..scene.tubes import Splines
+from ..scene.surfaces import Splines
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
 from .points import INSET, clearance

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.upload import uploaded
-from ..scene.tubes import NONE, Rods
+from ..scene.surfaces import NONE, Rods
 
 #: Rows of a side, of an end sphere, and of a crease: hidden or distant parts get their own weight.
 SIDE_PIECES, END_PIECES, CREASE_PIECES = 4, 8, 2

@@ -111,10 +111,10 @@ def pattern_kinds(
 def _on_curves(job: Job, centre: mi.Point3f) -> list[EdgeKind]:
     """The patterns of B-spline and linear curves."""
     kinds: list[EdgeKind] = []
-    if job.tubes is None:
+    if job.surfaces is None:
         return kinds
     for segments, plugin, kind in (
-        (job.tubes.splines, "bsplinecurve", TubePatterns), (job.tubes.rods, "linearcurve", RodPatterns)
+        (job.surfaces.splines, "bsplinecurve", TubePatterns), (job.surfaces.rods, "linearcurve", RodPatterns)
     ):  # fmt: skip
         chosen = [facts for facts in edge_shapes(job).facts if facts.kind == "curve" and facts.plugin == plugin]
         if segments is None or not any(facts.patterns for facts in chosen):

@@ -89,13 +89,13 @@ def edge_table(job: Job) -> EdgeTable:
     curves = _analytic(job, analytic, centre)
     if curves is not None:
         kinds.append(curves)
-    if job.tubes is not None and job.tubes.splines is not None:
-        kinds.append(TubeOutlines(job.tubes.splines, tube_rows(job.tubes.splines), centre))
-    if job.tubes is not None and job.tubes.rods is not None:
-        kinds.append(RodEdges(job.tubes.rods, rod_rows(job.tubes.rods), centre))
-    if job.tubes is not None and job.tubes.ellipsoids is not None:
-        kinds.append(EllipsoidOutlines(job.tubes.ellipsoids, centre))
-        warn_about_touching(job.tubes.ellipsoids, job.call.memory)
+    if job.surfaces is not None and job.surfaces.splines is not None:
+        kinds.append(TubeOutlines(job.surfaces.splines, tube_rows(job.surfaces.splines), centre))
+    if job.surfaces is not None and job.surfaces.rods is not None:
+        kinds.append(RodEdges(job.surfaces.rods, rod_rows(job.surfaces.rods), centre))
+    if job.surfaces is not None and job.surfaces.ellipsoids is not None:
+        kinds.append(EllipsoidOutlines(job.surfaces.ellipsoids, centre))
+        warn_about_touching(job.surfaces.ellipsoids, job.call.memory)
     grids = scene_grids(job)
     if grids is not None:
         stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]
@@ -171,7 +171,7 @@ def _between_faces(
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count
         if rows is not None:
-            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.tubes))
+            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.surfaces))
     dr.eval([kind.rows for kind in kinds])  # now, not with the term that needs them first: its kernels would differ
     return kinds, hidden
 

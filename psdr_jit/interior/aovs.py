@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..core import film as films
 from ..core.ad import backpropagate, tangents
 from ..paths.aovs import Aovs
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from .camera_pass import camera_passes
 
@@ -20,7 +20,7 @@ def _images(job: Job, aovs: Aovs) -> Iterator[mi.TensorXf]:
     for p in camera_passes(job):
         with dr.resume_grad():
             pi = job.scene.ray_intersect_preliminary(p.ray, coherent=True)
-            si = surface_at(job.tubes, pi, p.ray, mi.RayFlags.All)
+            si = surface_at(job.surfaces, pi, p.ray, mi.RayFlags.All)
             values = [value * p.share for value in aovs.values(si, p.ray.o)]
             yield films.develop_channels(job.film, aovs.channels, p.at, values)
 

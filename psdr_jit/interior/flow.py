@@ -38,7 +38,7 @@ from ..paths.recording import PathRecords
 from ..paths.rough_plastic import RoughPlastic, eval_attached
 from ..paths.smooth_lights import SmoothLights
 from ..plan.motion import Displacements
-from ..scene.tubes import Tubes
+from ..scene.surfaces import Surfaces
 
 
 @dataclass
@@ -58,7 +58,7 @@ class SceneTraits:
     delta_emitters: bool
     delta_lobes: bool  # where geometry moves, only the spatial flow follows them
     smooth_lights: SmoothLights | None  # if there are any
-    tubes: Tubes | None = None  # curves
+    surfaces: Surfaces | None = None  # that Mitsuba does not evaluate
     followed: FollowedLights | None = None  # lights whose emission follows directions (spatial flow only)
     lights_rest: bool = False  # area lights stay where they are, and as large
     orbits: Orbits | None = None  # spheres that carry directions along (spatial flow only)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Arrival, Vertex
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, delta_factor
 
@@ -26,7 +26,7 @@ class RestingFlow(Flow):
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
     ) -> VertexTerms:
-        si = surface_at(self.traits.tubes, vertex.hit.intersection(), ray, mi.RayFlags.All)
+        si = surface_at(self.traits.surfaces, vertex.hit.intersection(), ray, mi.RayFlags.All)
         bsdf = si.bsdf()
         emits = vertex.weight_emission > 0
         L = dr.select(emits, vertex.weight_emission * si.emitter(self.scene).eval(si, emits), 0)
@@ -42,7 +42,7 @@ class RestingFlow(Flow):
         nee, active = vertex.nee, vertex.nee.emitter != 0
         emitter = dr.reinterpret_array(mi.EmitterPtr, nee.emitter)
         ray = mi.Ray3f(si.p, nee.d, 0, si.wavelengths)
-        source = surface_at(self.traits.tubes, nee.hit(si.p).intersection(), ray, mi.RayFlags.All, active)
+        source = surface_at(self.traits.surfaces, nee.hit(si.p).intersection(), ray, mi.RayFlags.All, active)
         value = emitter.eval(source, active)
         if self.traits.delta_emitters:
             is_delta = active & nee.delta

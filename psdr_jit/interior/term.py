@@ -137,7 +137,7 @@ def flow_of(job: Job) -> Flow:
     # a probe moves everything
     lights_rest = job.plan.prunes and job.learns and not (facts.emitters_move or _area_lights_change(facts))
     traits = SceneTraits(
-        facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.tubes, followed_lights(job), lights_rest,
+        facts.has_delta_emitters, facts.has_delta_lobes, smooth_lights, job.surfaces, followed_lights(job), lights_rest,
         job.orbits, job.rough_plastic,
     )
     if not facts.geometry_moves and (job.plan.prunes or traits.delta_lobes):  # which no other flow knows

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Continuation
-from ..scene.tubes import Tubes
+from ..scene.surfaces import Surfaces
 from .critical_angle import CriticalAngle
 from .edge_on import EdgeOn
 from .light_technique import LightTechnique
@@ -37,7 +37,7 @@ class PathLimits:
     critical: CriticalAngle | None = None  # glass whose index is differentiated, see `critical_angle`
     refuses: bool = False  # some BSDF refuses directions it has sampled, and black paths go on: see `scattering`
     own_frames: bool = False  # some BSDF sees how its frame is turned about the normal: see `rays.interaction`
-    tubes: Tubes | None = None  # the curves of the scene: see `tube_surface`
+    surfaces: Surfaces | None = None  # that Mitsuba does not evaluate: see `surface_at`
     light: LightTechnique | None = None  # light subpaths find paths as well: weights leave them their share
     aim: Aim | None = None  # where the next direction is worth taking
     aligned: bool = False  # numbers of mirrors and glass are their own: see `walk`

@@ -12,7 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.tubes import Cylinders
+from ..scene.surfaces import Cylinders
 from .own_surface import of_hit, on_ray, where_active
 
 #: How far off the surface the ray along the normal starts, in radii: below 2, for it may start inside.

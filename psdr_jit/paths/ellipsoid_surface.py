@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.tubes import Ellipsoids
+from ..scene.surfaces import Ellipsoids
 from .own_surface import of_hit, on_ray, where_active
 
 

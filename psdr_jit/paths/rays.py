@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from .bounce import PathLimits
-from .tube_surface import surface_at
+from .surface_at import surface_at
 
 #: Relative shortening of a shadow ray, as in Mitsuba's `Interaction::spawn_ray_to` (`math::ShadowEpsilon`).
 SHADOW_EPSILON = 1e-3
@@ -96,7 +96,7 @@ def interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, limits: PathLim
     random numbers, a path would go on in another direction from the next triangle of the same plane, and the difference
     of radiance across their edge, which is nearly 0, would be noise.
     """
-    si = surface_at(limits.tubes, pi, ray, mi.RayFlags.All)
+    si = surface_at(limits.surfaces, pi, ray, mi.RayFlags.All)
     if limits.own_frames:
         return si
     si.sh_frame = mi.Frame3f(si.sh_frame.n)

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.curve_frame import turns
-from ..scene.tubes import Rods
+from ..scene.surfaces import Rods
 from .own_surface import of_hit, on_ray, where_active
 
 

@@ -24,7 +24,7 @@ from ..paths.rough_plastic import RoughPlastic, rough_plastic
 from ..paths.walk import PathLimits
 from ..scene.facts import SceneFacts
 from ..scene.mesh_tables import CallVariables
-from ..scene.tubes import Tubes, tubes_of
+from ..scene.surfaces import Surfaces, surfaces_of
 from .call import Call
 from .light_plan import light_technique
 from .motion import Motion, SceneMotion
@@ -33,8 +33,8 @@ from .plan import Plan
 #: Of one render call: the geometry of its sensor.
 FRAME: Slot[SensorFrame | None] = Slot(lambda: None)
 
-#: Of one render call: the curves of its scene.
-TUBES: Slot[Tubes | None] = Slot(lambda: None)
+#: Of one render call: the surfaces of its scene that Mitsuba does not evaluate.
+SURFACES: Slot[Surfaces | None] = Slot(lambda: None)
 
 #: Of one render call: spheres that carry directions along.
 ORBITS: Slot[Orbits | None] = Slot(lambda: None)
@@ -104,9 +104,9 @@ class Job:
         return self.shared.once(FRAME, lambda: sensor_frame(self.sensor))
 
     @property
-    def tubes(self) -> Tubes | None:
-        """The curves of the scene, read once per render call."""
-        return tubes_of_call(self.call, self.facts, self.shared)
+    def surfaces(self) -> Surfaces | None:
+        """The surfaces of the scene that Mitsuba does not evaluate, read once per render call."""
+        return surfaces_of_call(self.call, self.facts, self.shared)
 
     @property
     def light(self) -> LightTechnique | None:
@@ -147,7 +147,8 @@ class Job:
     @property
     def limits(self) -> PathLimits:
         own_frames = any(shape.sees_frame for shape in self.facts.shapes)
-        return PathLimits(self.options.depth_limit, self.options.rr_depth, own_frames=own_frames, tubes=self.tubes)
+        depth, roulette = self.options.depth_limit, self.options.rr_depth
+        return PathLimits(depth, roulette, own_frames=own_frames, surfaces=self.surfaces)
 
     @property
     def limits_beside(self) -> PathLimits:
@@ -158,15 +159,15 @@ class Job:
         return replace(self.limits, aligned=True, edge_on=edge_on)
 
 
-def tubes_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Tubes | None:
-    """The curves of the scene, read once per render call."""
-    return shared.once(TUBES, lambda: tubes_of(call.scene, facts, call.memory))
+def surfaces_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Surfaces | None:
+    """The surfaces of the scene that Mitsuba does not evaluate, read once per render call."""
+    return shared.once(SURFACES, lambda: surfaces_of(call.scene, facts, call.memory))
 
 
 def in_motion(shared: Memory) -> list[CallVariables]:
     """Variables that stand for what moves, in what the terms of a render call share."""
-    tubes = shared[TUBES]
-    return [] if tubes is None or tubes.meshes is None else tubes.meshes.in_motion()
+    surfaces = shared[SURFACES]
+    return [] if surfaces is None or surfaces.meshes is None else surfaces.meshes.in_motion()
 
 
 def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterator[tuple[float, Job]]:

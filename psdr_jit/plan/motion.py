@@ -20,8 +20,8 @@ from ..core.ad import tangents
 from ..core.records import Hit
 from ..core.sensor_frame import film_area
 from ..paths.light_source import is_far
-from ..paths.tube_surface import surface_at
-from ..scene.tubes import Tubes
+from ..paths.surface_at import surface_at
+from ..scene.surfaces import Surfaces
 
 
 class Displacements(ABC):
@@ -100,13 +100,13 @@ class SceneMotion(Motion):
     """The motion that the enabled parameters of the scene stand for."""
 
     sensor: mi.Sensor
-    tubes: Tubes | None = None
+    surfaces: Surfaces | None = None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
         with dr.resume_grad():
             dr.enable_grad(*variables)
-            yield SceneDisplacements(self.sensor, self.tubes)
+            yield SceneDisplacements(self.sensor, self.surfaces)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         with dr.resume_grad():
@@ -123,11 +123,11 @@ class SceneDisplacements(Displacements):
     """Read off Mitsuba's own attached geometry."""
 
     sensor: mi.Sensor
-    tubes: Tubes | None
+    surfaces: Surfaces | None
 
     def of_surface(self, hit: Hit) -> mi.Vector3f:
         there = hit.shape != 0
-        x = surface_at(self.tubes, hit.intersection(), mi.Ray3f(hit.o, hit.d), _follow(), there).p
+        x = surface_at(self.surfaces, hit.intersection(), mi.Ray3f(hit.o, hit.d), _follow(), there).p
         return dr.select(there, moved(x), 0)
 
     def of_edge(self, table, location, ω: mi.Vector3f) -> mi.Vector3f:
@@ -150,13 +150,13 @@ class SceneDisplacements(Displacements):
     def material_point(self, hit: Hit, wavelengths) -> mi.Point3f:
         pi = hit.intersection()
         ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
-        return surface_at(self.tubes, pi, ray, _follow(), pi.is_valid()).p
+        return surface_at(self.surfaces, pi, ray, _follow(), pi.is_valid()).p
 
     def surface(self, hit: Hit, ray: mi.Ray3f, flags) -> mi.SurfaceInteraction3f:
-        return surface_at(self.tubes, hit.intersection(), ray, flags)
+        return surface_at(self.surfaces, hit.intersection(), ray, flags)
 
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-        return surface_at(self.tubes, hit.intersection(), ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+        return surface_at(self.surfaces, hit.intersection(), ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
 
     def footprint(self, kind: str, film: mi.Point2f, aperture: mi.Point2f) -> mi.Float:
         ray, _ = self.sensor.sample_ray(0, 0.5, film, aperture)

@@ -15,10 +15,10 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..core.varying import varying
-from ..paths.tube_surface import surface_at
+from ..paths.surface_at import surface_at
 from ..scene.facts import SceneFacts
 from ..scene.registry import registry_table
-from ..scene.tubes import Tubes
+from ..scene.surfaces import Surfaces
 from .motion import Displacements, Motion
 
 #: Direction of the shift and axis of the turn: none that a scene is likely to be aligned with, nor with each other.
@@ -36,7 +36,7 @@ class ProbeMotion(Motion):
     centre: mi.Point3f
     shift: mi.Vector3f
     turn: mi.Vector3f  # as fast at the rim of what moves as the shift
-    tubes: Tubes | None
+    surfaces: Surfaces | None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
@@ -101,14 +101,14 @@ class ProbeDisplacements(Displacements):
         ray = mi.Ray3f(ray)
         ray.o = ray.o - self._of_point(hit.o, moving)
         ray.d = ray.d - dr.cross(w, hit.d)
-        si = surface_at(self.probe.tubes, pi, ray, flags)
+        si = surface_at(self.probe.surfaces, pi, ray, flags)
         si.p = si.p + self._of_point(si.p, moving)
         si.n, si.sh_frame = _turned(si, w)
         return si
 
     def material(self, hit: Hit, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
         follow = mi.RayFlags.All | mi.RayFlags.FollowShape
-        si = surface_at(self.probe.tubes, hit.intersection(), ray, follow, active)
+        si = surface_at(self.probe.surfaces, hit.intersection(), ray, follow, active)
         si.p = si.p + self._of_point(si.p, self.probe.takes_part(hit.shape))
         si.n, si.sh_frame = _turned(si, self._turn_of(hit.shape))
         return si
@@ -126,7 +126,7 @@ def _turned(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> tuple[mi.Normal3f, m
     return mi.Normal3f(si.n + dr.cross(w, dr.detach(si.n))), frame
 
 
-def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None) -> ProbeMotion:
+def probe_motion(scene: mi.Scene, facts: SceneFacts, surfaces: Surfaces | None = None) -> ProbeMotion:
     """The probe of a scene, about the middle of what moves."""
     # glass that bends paths takes part: what is seen through it moves much as if it did
     moving = {s.index for s in facts.shapes if (s.moves or s.bends) and s.index >= 0}
@@ -144,5 +144,5 @@ def probe_motion(scene: mi.Scene, facts: SceneFacts, tubes: Tubes | None = None)
         varying(mi.Point3f, list(sphere.center)),
         varying(mi.Vector3f, list(SHIFT)),
         varying(mi.Vector3f, turn),
-        tubes,
+        surfaces,
     )

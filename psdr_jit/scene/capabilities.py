@@ -40,7 +40,7 @@ PLUGIN_NAMES = {
 ANALYTIC_SHAPES = frozenset({"rectangle", "disk", "sphere", "cylinder"})
 
 CURVE_SHAPES = frozenset({"bsplinecurve", "linearcurve"})
-"""Tubes about splines and straight lines (`scene.tubes`)."""
+"""Tubes about splines and straight lines (`scene.surfaces`)."""
 
 GRID_SHAPES = frozenset({"sdfgrid"})
 """Isosurfaces of values on a grid."""

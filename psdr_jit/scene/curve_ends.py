@@ -1,7 +1,7 @@
 """Mitsuba 3.9.1 reads past the segments of a B-spline curve where a ray meets the very end of it, and may crash there.
 
 Its derivatives by (u, v), which are asked for at every hit, look up segment number floor(v · count), which is `count`
-at v = 1 (`BSplineCurve::partials`). What is rendered here goes without them (`paths.tube_surface`); Mitsuba's own
+at v = 1 (`BSplineCurve::partials`). What is rendered here goes without them (`paths.surface_at`); Mitsuba's own
 `path` does not.
 """
 

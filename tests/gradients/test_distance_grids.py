@@ -25,7 +25,7 @@ from psdr_jit.plan.motion import SceneMotion
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.facts import analyse
 from psdr_jit.scene.grids import blends_normals, moving_grids
-from psdr_jit.scene.tubes import tubes_of
+from psdr_jit.scene.surfaces import surfaces_of
 
 SIZE = 2.2  # edge of a grid
 ONE_TERM = {"type": "psdr_path", "form": "spatial", "sppc": 1, "max_depth": 2}
@@ -115,11 +115,11 @@ def test_points_that_a_ring_throws_shadows_on_move_with_it(llvm):
     scene = scene_of(ring=grid(torus(12)))
     perturb(scene, "ring.grid").attach()
     facts = analyse(scene)
-    tubes = tubes_of(scene, facts, Memory())
+    surfaces = surfaces_of(scene, facts, Memory())
     d = dr.normalize(mi.Point3f(mi.Float(0.6, 0.6, 3), mi.Float(0.1, -0.1, 3), 0) - mi.Point3f(*EYE))
     ray = mi.Ray3f(mi.Point3f(*EYE), d)
     hit = Hit.of(ray, scene.ray_intersect_preliminary(ray))
-    with SceneMotion(scene.sensors()[0], tubes).attached() as moving:
+    with SceneMotion(scene.sensors()[0], surfaces).attached() as moving:
         moved = tangents(moving.of_surface(hit))
     speed = np.array(dr.norm(moved))
     assert (speed[:2] > 0.5).all()

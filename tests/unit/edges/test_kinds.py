@@ -31,7 +31,7 @@ from psdr_jit.edges.scene_table import scene_edges
 from psdr_jit.edges.table import traced
 from psdr_jit.scene import io as scene_io
 from psdr_jit.scene.params import also_enabled
-from psdr_jit.scene.tubes import tubes_of
+from psdr_jit.scene.surfaces import surfaces_of
 
 COUNT = 4096
 RADIUS, DISTANCE = 0.6, 4.0
@@ -163,8 +163,8 @@ def test_everything_shifted_shifts_the_edge(found):
     params.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)
     if isinstance(kind, Junctions):  # what it knows of meshes is of a call in which nothing moves
-        kind = replace(kind, tubes=tubes_of(job.scene, job.facts, Memory()))
-        for moving in kind.tubes.meshes.in_motion() if kind.tubes is not None else ():
+        kind = replace(kind, surfaces=surfaces_of(job.scene, job.facts, Memory()))
+        for moving in kind.surfaces.meshes.in_motion() if kind.surfaces is not None else ():
             moving.take_tangents()
     motion = kind.displacement(row, sight.at, sight.ω, mi.Bool(True))
     assert np.abs(np.array(motion)).max() == 0

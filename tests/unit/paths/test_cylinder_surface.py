@@ -10,9 +10,9 @@ import pytest
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.memory import Memory
 from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.paths.tube_surface import surface_at
+from psdr_jit.paths.surface_at import surface_at
 from psdr_jit.scene.facts import analyse
-from psdr_jit.scene.tubes import tubes_of
+from psdr_jit.scene.surfaces import surfaces_of
 
 RADIUS, LANES = 0.02, 20_000
 SHIFT = (0.6, 0.3, -0.5)
@@ -45,14 +45,14 @@ def of_both(scene: mi.Scene, ray: mi.Ray3f, how: dict, ray_moves: bool) -> tuple
     found = []
     for ours in (True, False):
         perturb(scene, "rod.to_world", **how).attach()
-        tubes = tubes_of(scene, analyse(scene), Memory()) if ours else None
+        surfaces = surfaces_of(scene, analyse(scene), Memory()) if ours else None
         with dr.resume_grad():
             o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
             dr.enable_grad(o, d)
             if ray_moves:
                 dr.set_grad(o, mi.Vector3f(0.2, -0.1, 0.4))
                 dr.set_grad(d, dr.cross(mi.Vector3f(-0.3, 0.2, 0.1), ray.d))
-            si = surface_at(tubes, pi, mi.Ray3f(o, d, 0, []), mi.RayFlags.All)
+            si = surface_at(surfaces, pi, mi.Ray3f(o, d, 0, []), mi.RayFlags.All)
             values = [getattr(si, name) for name in FIELDS]
             grads = tangents(*values)
         found.append([(np.atleast_2d(np.array(dr.detach(v))), np.atleast_2d(np.array(g)))

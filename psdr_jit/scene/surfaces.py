@@ -1,8 +1,9 @@
-"""The curves of a scene as tables: which segment a ray has met, and its control points.
+"""The surfaces that are evaluated here: curves and other bodies as tables, and in scenes of meshes all of them.
 
-Mitsuba's own attached evaluation of curves is not used. Of B-splines, its points do not stay on the surface where
-circles twist, and at the very end of a shape it reads past its segments; of linear curves, it has none. What is here is
-enough to evaluate them anew (`core.tube_axis`, `core.rod`, `paths.tube_surface`, `paths.rod_surface`).
+Of a curve, the tables say which segment a ray has met, and its control points. Mitsuba's own attached evaluation of
+curves is not used. Of B-splines, its points do not stay on the surface where circles twist, and at the very end of a
+shape it reads past its segments; of linear curves, it has none. What is here is enough to evaluate them anew
+(`core.tube_axis`, `core.rod`, `paths.surface_at`, `paths.rod_surface`).
 """
 
 from __future__ import annotations
@@ -134,7 +135,7 @@ class Cylinders:
 
 
 @dataclass(frozen=True)
-class Tubes:
+class Surfaces:
     """The curves of a scene, and what else has a surface that is not Mitsuba's to evaluate."""
 
     splines: Splines | None
@@ -142,14 +143,14 @@ class Tubes:
     grids: list[MovingGrid]
     ellipsoids: Ellipsoids | None
     cylinders: Cylinders | None
-    meshes: MeshTables | None = None  # where there is nothing else
+    meshes: MeshTables | None = None  # and spheres, where there is nothing else
 
 
-def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None:
-    """The curves, cylinders and moving grids of `scene`, or its meshes; None if Mitsuba evaluates every surface."""
+def surfaces_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Surfaces | None:
+    """The curves, cylinders and moving grids of `scene`, or its meshes and spheres; None if Mitsuba evaluates all."""
     meshes = mesh_tables(scene, memory)
     if meshes is not None:
-        return Tubes(None, None, [], None, None, meshes)
+        return Surfaces(None, None, [], None, None, meshes)
     curves = [s for s in facts.shapes if s.kind == "curve" and s.index >= 0]
     grids = moving_grids(scene, facts, memory)
     ellipsoids = [s for s in facts.shapes if s.kind == "ellipsoids" and s.index >= 0]
@@ -157,7 +158,7 @@ def tubes_of(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> Tubes | None
     if not curves and not grids and not ellipsoids and not cylinders:
         return None
     of = {plugin: [s for s in curves if s.plugin == plugin] for plugin in ("bsplinecurve", "linearcurve")}
-    return Tubes(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids,
+    return Surfaces(_table(Splines, scene, of["bsplinecurve"]), _table(Rods, scene, of["linearcurve"]), grids,
                  _table(Ellipsoids, scene, ellipsoids), _cylinders(scene, cylinders))  # fmt: skip
 
 

@@ -1,6 +1,7 @@
-"""The surface that a ray meets, on curves as on everything else: the one place that asks Mitsuba for it.
+"""The surface that a ray meets, on curves as on everything else: the one place that chooses who evaluates it.
 
-On a curve (`core.tube_axis`) the material point keeps its v and its place on the circle,
+In a scene of many meshes and spheres it is looked up (`tabled_surface`). On a curve (`core.tube_axis`) the material
+point keeps its v and its place on the circle,
 
     x(θ) = c + r a,        a the part of its former direction at right angles to c', of unit length
 
@@ -18,7 +19,7 @@ import mitsuba as mi
 
 from ..core.curve_frame import turns
 from ..core.tube_axis import Axis
-from ..scene.tubes import Splines, Tubes
+from ..scene.surfaces import Splines, Surfaces
 from .cylinder_surface import cylinder_surface
 from .ellipsoid_surface import ellipsoid_surface
 from .grid_surface import grid_surface
@@ -28,21 +29,22 @@ from .tabled_surface import tabled_surface
 
 
 def surface_at(
-    tubes: Tubes | None, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags, active: mi.Bool | bool = True
+    surfaces: Surfaces | None, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags, active: mi.Bool | bool = True
 ) -> mi.SurfaceInteraction3f:
     """`pi.compute_surface_interaction(ray, flags, active)`, attached to the ray and to the shape, curves included.
 
     With `RayFlags.FollowShape` points stay on their material.
     """
-    if tubes is None:
+    if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)
-    if tubes.meshes is not None:
-        return tabled_surface(tubes.meshes, pi, ray, flags, active)
-    families = [(tubes.splines, _spline_surface), (tubes.rods, rod_surface), (tubes.ellipsoids, ellipsoid_surface)]
-    families += [(grid, grid_surface) for grid in tubes.grids]
+    if surfaces.meshes is not None:
+        return tabled_surface(surfaces.meshes, pi, ray, flags, active)
+    families = [(surfaces.splines, _spline_surface), (surfaces.rods, rod_surface),
+                (surfaces.ellipsoids, ellipsoid_surface)]  # fmt: skip
+    families += [(grid, grid_surface) for grid in surfaces.grids]
     follow = int(flags) & int(mi.RayFlags.FollowShape) != 0
-    if tubes.cylinders is not None and not follow and (dr.grad_enabled(ray) or tubes.cylinders.attached()):
-        families.append((tubes.cylinders, cylinder_surface))
+    if surfaces.cylinders is not None and not follow and (dr.grad_enabled(ray) or surfaces.cylinders.attached()):
+        families.append((surfaces.cylinders, cylinder_surface))
     met = [(f, of, *f.segment(pi, active & pi.is_valid())) for f, of in families if f is not None]
     elsewhere = mi.Bool(active)  # a copy: the caller's mask is not ours to change
     for *_, on_curve in met:
