@@ -52,6 +52,11 @@ CRITICAL: Slot[CriticalAngle | None] = Slot(lambda: None)
 ROUGH_PLASTIC: Slot[RoughPlastic | None] = Slot(lambda: None)
 
 
+#: Passes from which on memory is given back after a term: of fewer it would be asked for again in the next call, which
+#: then takes a fifth longer (128 x 128, 64 spp: two passes).
+MANY_PASSES = 4
+
+
 @dataclass(frozen=True)
 class Job:
     """One term's share of a render call. Host data only; `spp` is the term's own budget."""
@@ -174,7 +179,7 @@ def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterat
     """Split a job so that one part's samples fit into `record_mib`: `(share of the samples, part)`.
 
     `pixels`: samples per spp, by default those of the crop window. Parts have seeds of their own; the split depends on
-    host data only, so forward and backward mode agree on it. Where there are several, Dr.Jit's cache of freed arrays is
+    host data only, so forward and backward mode agree on it. Where there are many, Dr.Jit's cache of freed arrays is
     emptied after the last one: the next term has arrays of other sizes, and would need as much once more.
     """
     if pixels is None:
@@ -187,5 +192,5 @@ def passes(job: Job, bytes_per_sample: int, pixels: int | None = None) -> Iterat
         seed = job.seed if done == 0 else mi.sample_tea_32(mi.UInt32(job.seed), mi.UInt32(done))[0]
         yield spp / job.spp, replace(job, call=replace(job.call, seed=seed), spp=spp)
         done += spp
-    if done > per_pass:
+    if done > (MANY_PASSES - 1) * per_pass:
         dr.flush_malloc_cache()
