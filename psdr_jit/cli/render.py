@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from psdr_jit.cli import common
 from psdr_jit.errors import OptionError
+
+#: Samples of a render that is not taken apart: some seconds.
+SLICE = 1 << 24
 
 NAME = "render"
 HELP = "render a scene"
@@ -20,6 +24,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default: 0)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+
+
+def slices(sensor: Any, spp: int, seed: int) -> list[tuple[int, int]]:
+    """`(samples per pixel, seed)` of renders whose mean is asked for: Ctrl-C is heard between kernels only.
+
+    One alone where samples of a pixel depend on each other.
+    """
+    import mitsuba as mi
+
+    spp = spp or sensor.sampler().sample_count()
+    width, height = sensor.film().crop_size()
+    most = max(1, SLICE // (int(width) * int(height)))
+    if spp <= most or sensor.sampler().class_name() != "IndependentSampler":
+        return [(spp, seed)]
+    parts = [min(most, spp - done) for done in range(0, spp, most)]
+    return [(part, int(mi.sample_tea_32(seed, k)[0]) if k else seed) for k, part in enumerate(parts)]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,7 +62,9 @@ def run(args: argparse.Namespace) -> int:
     from psdr_jit.derivative.integrator_specs import aovs_of, names_of_aovs, to_image
 
     require_samples(scene.sensors()[args.sensor], args.spp or 0)
-    image = to_image(mi.render(scene, sensor=args.sensor, spp=args.spp or 0, seed=args.seed))
+    parts = slices(scene.sensors()[args.sensor], args.spp or 0, args.seed)
+    total = sum(spp for spp, _ in parts)
+    image = sum(spp / total * to_image(mi.render(scene, sensor=args.sensor, spp=spp, seed=seed)) for spp, seed in parts)
     aovs = aovs_of(scene.integrator()) or names_of_aovs(scene, args.sensor, image.shape[-1])
     if output.suffix.lower() == ".exr":
         images.write_exr(output, {"primal": image}, aovs=aovs)

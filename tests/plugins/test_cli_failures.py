@@ -156,3 +156,18 @@ def test_integrators_that_see_no_edges_are_said_to(capsys):
     for name, told in (("prb", True), ("psdr_path", False)):
         assert main([*loud, "--integrator", name]) == 0
         assert ("edges and shadows bring is missing" in capsys.readouterr().out) == told
+
+
+def test_long_renders_are_taken_apart_for_ctrl_c(llvm):
+    """Samples add up, seeds differ; dependent samples stay together."""
+    from psdr_jit.cli.render import SLICE, slices
+
+    def sensor(kind: str) -> mi.Sensor:
+        film = {"type": "hdrfilm", "width": 1024, "height": SLICE // 4096}
+        return mi.load_dict({"type": "perspective", "film": film, "sampler": {"type": kind, "sample_count": 16}})
+
+    assert slices(sensor("independent"), 4, 7) == [(4, 7)]
+    parts = slices(sensor("independent"), 0, 7)
+    assert [spp for spp, _ in parts] == [4] * 4 and len({seed for _, seed in parts}) == 4
+    assert [spp for spp, _ in slices(sensor("independent"), 6, 7)] == [4, 2]
+    assert slices(sensor("multijitter"), 0, 7) == [(16, 7)]
