@@ -20,9 +20,10 @@ from .varying import varying
 #: Arrays up to which they are joined on the device.
 FEW = 8
 
-#: How many joined arrays are kept, with those they are made of: a kept array is replaced when it is written to, so that
-#: its index stands for its values. A call joins about ten.
-KEPT = 32
+#: Bytes of joined arrays that are kept, and as many of those they are made of: a kept array is replaced when it is
+#: written to, so that its index stands for its values. A call joins about ten.
+KEPT = 1 << 26
+BYTES = 4  # of an entry
 _JOINED: OrderedDict[tuple, tuple[list, Any]] = OrderedDict()
 
 
@@ -52,9 +53,9 @@ def _by_host(kind: type, arrays: list[Any]) -> Any:
     else:
         whole = np.concatenate([np.array(dr.detach(array)).ravel() for array in arrays])
         _JOINED[key] = (still, uploaded(kind, whole))
-        if len(_JOINED) > KEPT:
-            _JOINED.popitem(last=False)
     result = kind(_JOINED[key][1])
+    while BYTES * sum(dr.width(whole) for _, whole in _JOINED.values()) > KEPT:
+        _JOINED.popitem(last=False)
     start = 0
     for array, own in zip(arrays, moves, strict=True):
         size = dr.width(array)

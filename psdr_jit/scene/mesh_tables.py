@@ -36,6 +36,9 @@ SMOOTH, TEXTURED, FLIPPED, MOVES = (1 << k for k in range(4))
 #: shape that a call knows.
 FEWEST = 6
 
+#: Tables that an integrator keeps: of scenes, and of what moves in them.
+KEPT = 4
+
 #: Of an integrator: the tables of meshes that rest.
 TABLES: Slot[dict] = Slot(dict)
 
@@ -131,7 +134,10 @@ def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
     arrays += [buffer for mesh, own in zip(meshes, moves, strict=True) if not own for buffer in _buffers(mesh)]
     with dr.suspend_grad():
         key = (*ids.tolist(), *traits)
-        tables = while_unchanged(memory[TABLES], key, arrays, lambda: _tables(meshes, ids, traits, every.max() + 1))
+        kept = memory[TABLES]
+        tables = while_unchanged(kept, key, arrays, lambda: _tables(meshes, ids, traits, every.max() + 1))
+        while len(kept) > KEPT:
+            del kept[next(iter(kept))]
     return replace(tables, moving=moving, spheres=sphere_table(shapes, every, memory))
 
 

@@ -73,8 +73,8 @@ def sphere_table(shapes: Sequence[mi.Shape], ids: np.ndarray, memory: Memory) ->
         values = np.concatenate([np.array(dr.detach(x)).ravel() for x in every])
         return uploaded(mi.UInt32, place), uploaded(mi.Float, np.where(flipped, -1.0, 1.0)), uploaded(mi.Float, values)
 
-    by_shape, outward, kept = while_unchanged(memory[POSES], key, every, made)
-    poses = mi.Float(kept)
+    by_shape, outward, read_last = while_unchanged(memory[POSES], key, every, made)
+    poses = mi.Float(read_last)
     if moving:
         dr.enable_grad(poses)
     return SphereTable(by_shape, outward, poses, moving)

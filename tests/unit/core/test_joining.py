@@ -38,3 +38,19 @@ def test_what_is_joined_is_left_as_it_was(variant, count):
     result = joined(parts)
     dr.scatter(result, mi.Float(7), mi.UInt32(0))
     assert np.array_equal(parts[0], [0, 0]) and not dr.grad_enabled(result)
+
+
+def test_what_is_kept_follows_its_parts_and_has_a_limit(llvm, monkeypatch):
+    from psdr_jit.core import joining
+
+    joining._JOINED.clear()
+    parts = [mi.Float([k, -k]) for k in range(FEW + 1)]
+    first = np.array(joined(parts))
+    assert len(joining._JOINED) == 1 and np.array_equal(joined(parts), first) and len(joining._JOINED) == 1
+    dr.scatter(parts[3], mi.Float(7), mi.UInt32(0))
+    assert np.array(joined(parts))[6] == 7 and len(joining._JOINED) == 2
+    dr.enable_grad(parts[3])
+    parts[3] += 1  # what is attached is read anew
+    assert np.array(dr.detach(joined(parts)))[6] == 8
+    monkeypatch.setattr(joining, "KEPT", 0)
+    assert np.array(dr.detach(joined(parts)))[6] == 8 and not joining._JOINED

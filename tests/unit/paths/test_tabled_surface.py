@@ -13,7 +13,7 @@ from benchmarks import meshes
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.memory import Memory
 from psdr_jit.paths.tabled_surface import tabled_surface
-from psdr_jit.scene.mesh_tables import mesh_tables
+from psdr_jit.scene.mesh_tables import KEPT, TABLES, mesh_tables
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -190,6 +190,13 @@ def test_tables_are_made_again_only_when_a_resting_mesh_has_changed():
     own, known = (columns(values_of(si)) for si in (
         tabled_surface(changed, pi, ray, mi.RayFlags.All), pi.compute_surface_interaction(ray)))  # fmt: skip
     assert np.abs(own[1] - known[1])[:, np.array(pi.is_valid())].max() < 1e-5
+
+
+def test_few_tables_are_kept():
+    memory, scenes = Memory(), [scene_of() for _ in range(KEPT + 2)]
+    for scene in scenes:
+        mesh_tables(scene, memory)
+    assert len(memory[TABLES]) == KEPT
 
 
 def test_other_shapes_are_left_to_mitsuba():
