@@ -146,6 +146,7 @@ def test_forward_and_backward_agree_on_what_a_floor_sees(llvm):
     assert Jv > 1e-3 and abs(wJv - JTwv) <= 1e-6 * w * Jv
 
 
+@pytest.mark.slow
 def test_a_border_mirrored_at_the_very_rim(llvm):
     """The border of a floor passes behind a ball; what the ball mirrors of it leaves its outline at a tangent.
 

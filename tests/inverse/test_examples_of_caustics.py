@@ -28,6 +28,7 @@ def test_targets_show_the_caustic(llvm):
     assert np.allclose(seen, same, rtol=1e-4) and seen.max() > 5 * path.max()
 
 
+@pytest.mark.slow
 def test_a_lens_takes_shape(llvm):
     """A few iterations bring the image of its caustic closer to that of the picture."""
     result = loop.run(config.problem_of(read("lens", iterations=8)))
