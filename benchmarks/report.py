@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import inverse_tables, planning_tables, rows, sentences, survey_tables, tables
-from benchmarks.sentences import place
 from psdr_jit.scene.capabilities import support_table
 
 README = rows.ROOT / "README.md"
@@ -252,7 +251,7 @@ def circumstances(found: list[dict[str, Any]]) -> list[str]:
     for row in found:
         machine, v = row["machine"], row["versions"]
         text = (
-            f"{row['bench']}: {row['date'][:10]}, {place(machine)}, "
+            f"{row['bench']}: {row['date'][:10]}, {sentences.place(machine)}, "
             f"Mitsuba {v['mitsuba']}, Dr.Jit {v['drjit']}, {backend(v)}, {v['variant']}, commit {row['commit']}"
         )
         groups.setdefault(text, []).append(row)

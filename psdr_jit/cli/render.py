@@ -31,7 +31,7 @@ def slices(sensor: Any, spp: int, seed: int) -> list[tuple[int, int]]:
 
     One alone where samples of a pixel depend on each other.
     """
-    import mitsuba as mi
+    from psdr_jit.core.streams import other_seed
 
     spp = spp or sensor.sampler().sample_count()
     width, height = sensor.film().crop_size()
@@ -39,7 +39,7 @@ def slices(sensor: Any, spp: int, seed: int) -> list[tuple[int, int]]:
     if spp <= most or sensor.sampler().class_name() != "IndependentSampler":
         return [(spp, seed)]
     parts = [min(most, spp - done) for done in range(0, spp, most)]
-    return [(part, int(mi.sample_tea_32(seed, k)[0]) if k else seed) for k, part in enumerate(parts)]
+    return [(part, int(other_seed(seed, k)[0]) if k else seed) for k, part in enumerate(parts)]
 
 
 def run(args: argparse.Namespace) -> int:

@@ -36,14 +36,14 @@ def positions_buffer(mesh: mi.Mesh) -> mi.Float:
     return _parameter(mesh, VERTEX_POSITIONS).array if INDEXED_MESHES else mesh.vertex_positions_buffer()
 
 
+def vertex_buffers(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Positions, normals and texture coordinates; empty where it has none."""
+    return positions_buffer(mesh), normals_buffer(mesh), texcoords_buffer(mesh)
+
+
 def mesh_buffers(mesh: mi.Mesh) -> tuple:
     """All arrays on which edges depend; each is replaced by another when it changes."""
-    if INDEXED_MESHES:
-        params = mi.traverse(mesh)
-        keys = (VERTEX_POSITIONS, VERTEX_NORMALS, VERTEX_TEXCOORDS, FACES)
-        return tuple(params[key].array for key in keys if key in params)
-    return (mesh.vertex_positions_buffer(), mesh.vertex_normals_buffer(), mesh.vertex_texcoords_buffer(),
-            mesh.faces_buffer())  # fmt: skip
+    return (*vertex_buffers(mesh), faces_buffer(mesh))
 
 
 def normals_buffer(mesh: mi.Mesh) -> mi.Float:

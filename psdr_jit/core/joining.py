@@ -50,13 +50,13 @@ def _by_host(kind: type, arrays: list[Any]) -> Any:
     key = (kind, *(-dr.width(array) if own else array.index for array, own in zip(arrays, moves, strict=True)))
     if key in _JOINED:
         _JOINED.move_to_end(key)
+        whole = _JOINED[key][1]
     else:
-        whole = np.concatenate([np.array(dr.detach(array)).ravel() for array in arrays])
-        _JOINED[key] = (still, uploaded(kind, whole))
-    result = kind(_JOINED[key][1])
-    while BYTES * sum(dr.width(whole) for _, whole in _JOINED.values()) > KEPT:
-        _JOINED.popitem(last=False)
-    start = 0
+        whole = uploaded(kind, np.concatenate([np.array(dr.detach(array)).ravel() for array in arrays]))
+        _JOINED[key] = (still, whole)
+        while BYTES * sum(dr.width(known) for _, known in _JOINED.values()) > KEPT:
+            _JOINED.popitem(last=False)
+    result, start = kind(whole), 0
     for array, own in zip(arrays, moves, strict=True):
         size = dr.width(array)
         if own:
@@ -64,6 +64,17 @@ def _by_host(kind: type, arrays: list[Any]) -> Any:
             dr.scatter(result, array, place, mode=dr.ReduceMode.Permute)
         start += size
     return result
+
+
+def joined_points(kind: type, arrays: Sequence[Any]) -> Any:
+    """Flat arrays of coordinates one after the other, as points, vectors or normals of type `kind`."""
+    flat = joined(arrays)
+    return dr.gather(kind, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
+
+
+def starts(counts: Sequence[int]) -> np.ndarray:
+    """Where each of several runs with so many entries begins."""
+    return np.cumsum(counts) - counts
 
 
 def pointers(kind: type, objects: Sequence[Any]) -> Any:

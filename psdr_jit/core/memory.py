@@ -57,9 +57,17 @@ def same_arrays(kept: list[Any], arrays: list[Any]) -> bool:
     return [a.index for a in kept] == [a.index for a in arrays]
 
 
-def while_unchanged(kept: dict[K, tuple[list[Any], T]], key: K, arrays: list[Any], make: Callable[[], T]) -> T:
-    """What `make()` returned for `key`, made anew once one of the arrays it is made from has been replaced."""
+def while_unchanged(
+    kept: dict[K, tuple[list[Any], T]], key: K, arrays: list[Any], make: Callable[[], T], most: int | None = None
+) -> T:
+    """What `make()` returned for `key`, made anew once one of the arrays it is made from has been replaced.
+
+    `most`: how many keys are kept, the newest; None for keys that cannot become many.
+    """
     arrays = [dr.detach(array) for array in arrays]
     if key not in kept or not same_arrays(kept[key][0], arrays):
         kept[key] = (arrays, make())
-    return kept[key][1]
+    found = kept[key][1]
+    while most is not None and len(kept) > most:
+        del kept[next(iter(kept))]
+    return found

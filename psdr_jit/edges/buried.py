@@ -29,6 +29,8 @@ DEPTH, ROUNDING = 1e-4, 1e-6
 
 def buried(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> mi.Bool | None:
     """Rows that lie inside of one of `bodies`. None if none of these can hide anything."""
+    if not bodies:
+        return None
     found, shapes = None, edge_shapes(job).shapes
     starts = [origin_box(job.frame), *(_place(job, k, e) for k, e in enumerate(job.facts.emitters) if not e.infinite)]
     lonely = _lonely([box_of(shape) for shape in shapes])

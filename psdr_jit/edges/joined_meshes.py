@@ -13,10 +13,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import faces_buffer, mesh_faces, mesh_positions, positions_buffer
-from ..core.joining import joined
+from ..core.compat import mesh_faces, mesh_positions, positions_buffer
+from ..core.joining import joined, joined_points, starts
 from ..core.upload import uploaded
 from ..core.varying import varying
+from ..scene.mesh_tables import joined_corners
 from .geometry import EdgeTopologyDevice
 
 
@@ -36,23 +37,20 @@ def attached_positions(meshes: Sequence[mi.Mesh]) -> mi.Point3f:
     if len(meshes) == 1:
         # Asked for twice, Dr.Jit 1.5 loses a part of the adjoint of one of two equal gathers; of products it does not.
         return mi.Point3f(mesh_positions(meshes[0]) * varying(mi.Float, 1))
-    flat = joined([positions_buffer(mesh) for mesh in meshes])
-    return dr.gather(mi.Point3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
+    return joined_points(mi.Point3f, [positions_buffer(mesh) for mesh in meshes])
 
 
 def joined_faces(meshes: Sequence[mi.Mesh]) -> mi.Vector3u:
     """Corners of all faces, as numbers of vertices of all meshes."""
     if len(meshes) == 1:
         return mesh_faces(meshes[0])
-    vertices, faces = ([count(mesh) for mesh in meshes] for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))
-    corners = dr.unravel(mi.Vector3u, joined([faces_buffer(mesh) for mesh in meshes]))
-    return corners + uploaded(mi.UInt32, np.repeat(_first(vertices), faces))
+    return dr.unravel(mi.Vector3u, joined_corners(meshes))
 
 
 def by_face(meshes: Sequence[mi.Mesh]) -> tuple[mi.UInt32, mi.UInt32]:
     """Index of its mesh and number in it, of all faces."""
     faces = [mesh.face_count() for mesh in meshes]
-    shape, number = np.repeat(np.arange(len(faces)), faces), np.arange(sum(faces)) - np.repeat(_first(faces), faces)
+    shape, number = np.repeat(np.arange(len(faces)), faces), np.arange(sum(faces)) - np.repeat(starts(faces), faces)
     return uploaded(mi.UInt32, shape), uploaded(mi.UInt32, number)
 
 
@@ -61,7 +59,7 @@ def joined_topology(
 ) -> JoinedTopology:
     """The edges of all meshes; `devices` and `shells` of each."""
     edges = [dr.width(device.v0) for device in devices]
-    vertex, face = (uploaded(mi.UInt32, np.repeat(_first([count(mesh) for mesh in meshes]), edges))
+    vertex, face = (uploaded(mi.UInt32, np.repeat(starts([count(mesh) for mesh in meshes]), edges))
                     for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))  # fmt: skip
 
     def column(name: str):
@@ -76,8 +74,3 @@ def joined_topology(
     found = JoinedTopology(together, shape, own.f0, own.f1, joined(shells))
     dr.eval(found)
     return found
-
-
-def _first(counts: Sequence[int]) -> np.ndarray:
-    """Where each of several runs with so many entries begins."""
-    return np.cumsum([0, *counts])[:-1]

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import normals_buffer
-from ..core.joining import joined, pointers
+from ..core.joining import joined, joined_points, pointers
 from ..core.memory import Memory
 from ..core.upload import uploaded
 from ..core.varying import varying
@@ -80,10 +80,7 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
 
 def _normals(meshes: tuple[mi.Mesh, ...]) -> mi.Normal3f:
     """Shading normals of all vertices, attached."""
-    if len(meshes) == 1:
-        return mi.Normal3f(meshes[0].vertex_normal(dr.arange(mi.UInt32, meshes[0].vertex_count())))
-    flat = joined([normals_buffer(mesh) for mesh in meshes])
-    return dr.gather(mi.Normal3f, flat, dr.arange(mi.UInt32, dr.width(flat) // 3))
+    return joined_points(mi.Normal3f, [normals_buffer(mesh) for mesh in meshes])
 
 
 def _gathered(positions: mi.Point3f, normals: mi.Normal3f, corner: mi.Vector3u, active: mi.Bool):

@@ -26,6 +26,7 @@ import mitsuba as mi
 
 from ..core.cones import towards_sphere
 from ..core.varying import varying
+from ..scene.registry import registry_indices
 
 #: Radius of a target's ball relative to that of the sphere around it: rounding must not leave its rim outside.
 MARGIN = 1.001
@@ -170,7 +171,7 @@ def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int]
     """
     emitters, shapes = scene.emitters(), scene.shapes()
     ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.emitters_dr())]
-    of_shape = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+    of_shape = registry_indices(scene)
     density, choice, owners = [0.0] * (max(ids) + 1), [0.0] * (max(ids) + 1), []
     for k in lights:
         owner = next((i for i, s in enumerate(shapes) if s.emitter() is emitters[k]), None)

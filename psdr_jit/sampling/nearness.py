@@ -15,6 +15,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.memory import Slot
 from ..core.sensor_frame import viewpoint
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.scene_table import scene_edges
@@ -25,8 +26,16 @@ from .film_edges import film_weights
 FAR = 4.0
 
 
+#: Of one render call: the factors.
+FACTORS: Slot[list[mi.Float] | None] = Slot(lambda: None)
+
+
 def nearness(job: Job) -> list[mi.Float] | None:
     """By kind of edge, the factor on the weight of each row; None for parallel views, which are at no distance."""
+    return job.shared.once(FACTORS, lambda: _found(job))
+
+
+def _found(job: Job) -> list[mi.Float] | None:
     table, eye = scene_edges(job), viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
     if job.frame.kind == "orthographic" or not table.kinds:
         return None

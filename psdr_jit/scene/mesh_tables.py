@@ -21,11 +21,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.ad import backpropagate, tangents
-from ..core.compat import faces_buffer, normals_buffer, positions_buffer, texcoords_buffer
-from ..core.joining import joined
+from ..core.compat import faces_buffer, vertex_buffers
+from ..core.joining import joined, starts
 from ..core.memory import Memory, Slot, while_unchanged
 from ..core.upload import uploaded
 from ..core.varying import varying
+from .registry import registry_indices, registry_values
 from .sphere_table import SphereTable, is_sphere, sphere_table
 
 #: What is known of a shape; bits of `MeshTables.traits`.
@@ -124,21 +125,18 @@ def mesh_tables(scene: mi.Scene, memory: Memory) -> MeshTables | None:
     meshes = [shape for shape in shapes if shape.is_mesh()]
     if len(shapes) < FEWEST or not meshes or not all(shape.is_mesh() or is_sphere(shape) for shape in shapes):
         return None
-    every = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
-    ids = every[[shape.is_mesh() for shape in shapes]]
+    chosen = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
     with dr.resume_grad():
-        moves = [dr.grad_enabled(_buffers(mesh)) for mesh in meshes]
+        moves = [dr.grad_enabled(vertex_buffers(mesh)) for mesh in meshes]
         moving = _moving([mesh for mesh, own in zip(meshes, moves, strict=True) if own]) if any(moves) else None
     traits = [_traits(mesh) | (MOVES if own else 0) for mesh, own in zip(meshes, moves, strict=True)]
     arrays = [faces_buffer(mesh) for mesh in meshes]
-    arrays += [buffer for mesh, own in zip(meshes, moves, strict=True) if not own for buffer in _buffers(mesh)]
+    arrays += [buffer for mesh, own in zip(meshes, moves, strict=True) if not own for buffer in vertex_buffers(mesh)]
+    ids = registry_indices(scene)
     with dr.suspend_grad():
-        key = (*ids.tolist(), *traits)
-        kept = memory[TABLES]
-        tables = while_unchanged(kept, key, arrays, lambda: _tables(meshes, ids, traits, every.max() + 1))
-        while len(kept) > KEPT:
-            del kept[next(iter(kept))]
-    return replace(tables, moving=moving, spheres=sphere_table(shapes, every, memory))
+        key = (*ids, *chosen, *traits)
+        tables = while_unchanged(memory[TABLES], key, arrays, lambda: _tables(scene, chosen, traits), KEPT)
+    return replace(tables, moving=moving, spheres=sphere_table(scene, ids, memory, KEPT))
 
 
 def _traits(mesh: mi.Mesh) -> int:
@@ -149,16 +147,11 @@ def _traits(mesh: mi.Mesh) -> int:
     return found
 
 
-def _buffers(mesh: mi.Mesh) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Positions, normals and texture coordinates; empty where it has none."""
-    return positions_buffer(mesh), normals_buffer(mesh), texcoords_buffer(mesh)
-
-
 def _vertices(mesh: mi.Mesh) -> Vertices:
     """Mitsuba's arrays, attached if they are, and zeros in place of those that it does not have."""
     sizes = (3 * mesh.vertex_count(), 3 * mesh.vertex_count(), 2 * mesh.vertex_count())
     return Vertices(*(array if dr.width(array) == size else dr.zeros(mi.Float, size)
-                      for array, size in zip(_buffers(mesh), sizes, strict=True)))  # fmt: skip
+                      for array, size in zip(vertex_buffers(mesh), sizes, strict=True)))  # fmt: skip
 
 
 def _joined(parts: Sequence[Vertices]) -> Vertices:
@@ -178,26 +171,27 @@ def _moving(meshes: Sequence[mi.Mesh]) -> Moving:
     return Moving(sources, own)
 
 
-def _tables(meshes: Sequence[mi.Mesh], ids: np.ndarray, traits: Sequence[int], size: int) -> MeshTables:
-    """Without what moves, and spheres. `ids`: registry indices, below `size`."""
-    vertices, faces = (np.array([count(mesh) for mesh in meshes])
-                       for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))  # fmt: skip
-    first_vertex, first_face = _first(vertices), _first(faces)
+def _tables(scene: mi.Scene, chosen: Sequence[int], traits: Sequence[int]) -> MeshTables:
+    """Without what moves, and spheres. `chosen`: numbers of the meshes in `scene.shapes()`."""
+    meshes = [scene.shapes()[k] for k in chosen]
+    vertices = np.array([mesh.vertex_count() for mesh in meshes])
     moves = np.array(traits) & MOVES != 0
-    shift = _first(np.where(moves, vertices, 0)) - first_vertex
-    corners = joined([faces_buffer(mesh) for mesh in meshes]) + uploaded(mi.UInt32, np.repeat(first_vertex, 3 * faces))
+    shift = starts(np.where(moves, vertices, 0)) - starts(vertices)
+    corners = joined_corners(meshes)
     dr.eval(corners)
 
-    def by_shape(values: np.ndarray) -> mi.UInt32:
-        table = np.zeros(size, np.int64)
-        table[ids] = values
-        return uploaded(mi.UInt32, table.astype(np.uint32))  # differences below 0 wrap around, and back
+    def by_shape(values: Sequence[int] | np.ndarray) -> mi.UInt32:
+        # differences below 0 wrap around, and back where they are added
+        return registry_values(scene, {k: int(value) % 2**32 for k, value in zip(chosen, values, strict=True)})
 
-    return MeshTables(by_shape(np.array(traits)), by_shape(first_face), by_shape(shift), corners,
+    first_face = starts([mesh.face_count() for mesh in meshes])
+    return MeshTables(by_shape(traits), by_shape(first_face), by_shape(shift), corners,
                       _joined([_vertices(mesh) for mesh in meshes]), None, any(t & SMOOTH for t in traits),
                       any(t & TEXTURED for t in traits))  # fmt: skip
 
 
-def _first(counts: np.ndarray) -> np.ndarray:
-    """Where each of several runs with so many entries begins."""
-    return np.cumsum(counts) - counts
+def joined_corners(meshes: Sequence[mi.Mesh]) -> mi.UInt32:
+    """Corners of all faces, flat, as numbers of vertices of all meshes."""
+    vertices, faces = ([count(mesh) for mesh in meshes] for count in (mi.Mesh.vertex_count, mi.Mesh.face_count))
+    flat = joined([faces_buffer(mesh) for mesh in meshes])
+    return flat + uploaded(mi.UInt32, np.repeat(starts(vertices), 3 * np.array(faces)))

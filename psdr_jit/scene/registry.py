@@ -17,9 +17,14 @@ def registry_table(scene: mi.Scene, chosen: set[int]) -> mi.UInt32:
     return registry_values(scene, {index: 1 for index in chosen if index >= 0})
 
 
+def registry_indices(scene: mi.Scene) -> list[int]:
+    """By number in `scene.shapes()`: the registry index."""
+    return [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+
+
 def registry_values(scene: mi.Scene, values: Mapping[int, int]) -> mi.UInt32:
     """By registry index of a shape: the value given for its number in `scene.shapes()`, or 0."""
-    ids = [int(i) for i in dr.reinterpret_array(mi.UInt32, scene.shapes_dr())]
+    ids = registry_indices(scene)
     table = [0] * (max(ids, default=0) + 1)
     for index, value in values.items():
         table[ids[index]] = value

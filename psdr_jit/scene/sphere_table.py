@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,9 +12,9 @@ from ..core.ad import accumulate, tangents
 from ..core.memory import Memory, Slot, while_unchanged
 from ..core.upload import uploaded
 from ..core.varying import varying
+from .grids import TO_WORLD
 from .names import plugin_name
-
-TO_WORLD = "to_world"
+from .registry import registry_values
 
 #: Numbers of a pose: three rows of its matrix.
 ROWS, COLUMNS = 3, 4
@@ -55,29 +54,30 @@ def is_sphere(shape: mi.Shape) -> bool:
     return plugin_name(shape) == "sphere"
 
 
-def sphere_table(shapes: Sequence[mi.Shape], ids: np.ndarray, memory: Memory) -> SphereTable | None:
-    """The spheres among `shapes`, whose registry indices are `ids`; None if there are none."""
+def sphere_table(scene: mi.Scene, ids: list[int], memory: Memory, most: int) -> SphereTable | None:
+    """The spheres of `scene`, whose shapes have these registry indices; None if there are none. `most`: how many tables
+    are kept.
+    """
+    shapes = scene.shapes()
     chosen = [k for k, shape in enumerate(shapes) if is_sphere(shape)]
     if not chosen:
         return None
     with dr.resume_grad():
         read = [_numbers(shapes[k]) for k in chosen]
         moving = tuple((which, own) for which, own in enumerate(read) if dr.grad_enabled(own))
-    place = np.zeros(ids.max() + 1, np.uint32)
-    place[ids[chosen]] = np.arange(1, len(chosen) + 1)
     flipped = [shapes[k].has_flipped_normals() for k in chosen]
     every = [x for own in read for x in own]
-    key = (*place.tolist(), *flipped)
 
     def made() -> tuple[mi.UInt32, mi.Float, mi.Float]:
+        place = registry_values(scene, {k: which + 1 for which, k in enumerate(chosen)})
         values = np.concatenate([np.array(dr.detach(x)).ravel() for x in every])
-        return uploaded(mi.UInt32, place), uploaded(mi.Float, np.where(flipped, -1.0, 1.0)), uploaded(mi.Float, values)
+        return place, uploaded(mi.Float, np.where(flipped, -1.0, 1.0)), uploaded(mi.Float, values)
 
-    by_shape, outward, read_last = while_unchanged(memory[POSES], key, every, made)
-    poses = mi.Float(read_last)
+    place, outward, known = while_unchanged(memory[POSES], (*ids, *chosen, *flipped), every, made, most)
+    poses = mi.Float(known)
     if moving:
         dr.enable_grad(poses)
-    return SphereTable(by_shape, outward, poses, moving)
+    return SphereTable(place, outward, poses, moving)
 
 
 def _numbers(sphere: mi.Shape) -> tuple[mi.Float, ...]:

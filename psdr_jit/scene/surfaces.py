@@ -25,7 +25,7 @@ from ..core.upload import uploaded
 from .facts import SceneFacts, ShapeFacts
 from .grids import TO_WORLD, MovingGrid, moving_grids
 from .mesh_tables import MeshTables, mesh_tables
-from .registry import registry_table
+from .registry import registry_indices, registry_table
 
 T = TypeVar("T", bound="Segments")
 
@@ -175,8 +175,8 @@ def _table(family: type[T], scene: mi.Scene, chosen: list[ShapeFacts]) -> T | No
     if not chosen:
         return None
     shapes = [scene.shapes()[s.index] for s in chosen]
-    ids = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
-    start, count = (np.full(ids.max() + 1, value, np.uint32) for value in (NONE, 1))
+    ids = registry_indices(scene)
+    start, count = (np.full(max(ids) + 1, value, np.uint32) for value in (NONE, 1))
     first, owner, offsets, points, segments = [], [], [], [], 0
     for k, (facts_of, shape) in enumerate(zip(chosen, shapes, strict=True)):
         params = mi.traverse(shape)

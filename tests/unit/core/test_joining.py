@@ -53,4 +53,5 @@ def test_what_is_kept_follows_its_parts_and_has_a_limit(llvm, monkeypatch):
     parts[3] += 1  # what is attached is read anew
     assert np.array(dr.detach(joined(parts)))[6] == 8
     monkeypatch.setattr(joining, "KEPT", 0)
-    assert np.array(dr.detach(joined(parts)))[6] == 8 and not joining._JOINED
+    dr.scatter(parts[4], mi.Float(9), mi.UInt32(0))
+    assert np.array(dr.detach(joined(parts)))[8] == 9 and not joining._JOINED
