@@ -3,6 +3,7 @@
     python -m benchmarks.public_scenes FOLDER...            (hours; append to benchmarks/results/public_scenes.jsonl)
     python -m benchmarks.public_scenes FOLDER --part 0/2    (every second scene, for two processes side by side)
     python -m benchmarks.public_scenes FOLDER --again       (what is undecided, that known best first)
+    python -m benchmarks.public_scenes FOLDER --again --variant cuda_ad_rgb --spp 512 --reference-spp 8192   (on a GPU)
 
 Each thing is moved a little, and compared with differences for so many seconds. What has a row is not done again. The
 first thing of every scene comes first, then the second of every scene: interrupted, a run has seen most scenes.
@@ -15,14 +16,26 @@ import random
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from benchmarks import rows
-from benchmarks.survey import DEPTH, NOT_FINITE, SIDE, UNDECIDED, WRONG, Row, movable, row_of, shrunk, spread
+from benchmarks.survey import (
+    DEPTH,
+    NOT_FINITE,
+    SIDE,
+    UNDECIDED,
+    WRONG,
+    Effort,
+    Row,
+    movable,
+    row_of,
+    shrunk,
+    spread,
+)
 from psdr_jit.errors import PsdrError
 from psdr_jit.scene import io as scene_io
 
@@ -87,20 +100,20 @@ def case_of(name: str, param: str) -> str:
     return f"{name}: {param}"
 
 
-def measure(corpus: Corpus, path: Path, param: str, seconds: float) -> Row:
+def measure(corpus: Corpus, path: Path, param: str, effort: Effort) -> Row:
     """The row of one thing; an error that is not one of ours is a row as well."""
     start = time.perf_counter()
     try:
         scene = corpus.load(path)
         info = next(info for info in movable(scene) if info.name == param)
-        return row_of(scene, path.name, info, seconds)
+        return row_of(scene, path.name, info, effort)
     except Exception as error:  # noqa: BLE001  told, counted, and the next one is tried
         text = f"{type(error).__name__}: {error}"
         return Row(path.name, param, ERROR, None, None, text, time.perf_counter() - start)
 
 
-def stored(row: Row, case: str, seconds: float) -> dict[str, Any]:
-    settings = {"side": SIDE, "max_depth": DEPTH, "seconds": seconds, "motion": row.motion}
+def stored(row: Row, case: str, effort: Effort) -> dict[str, Any]:
+    settings = {"side": SIDE, "max_depth": DEPTH, **asdict(effort), "motion": row.motion}
     figures = {key: value for key, value in row.as_dict().items() if key not in ("scene", "param", "motion")}
     return {"bench": BENCH, "case": case, "method": "psdr_path", "settings": settings, **figures}
 
@@ -120,8 +133,12 @@ def main() -> int:
     parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth scene, from the Kth on")
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
     parser.add_argument("--again", action="store_true", help="look at what is undecided once more")
+    parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
+    parser.add_argument("--spp", type=int, default=Effort.spp, help="of an estimate (default: %(default)s)")
+    parser.add_argument("--reference-spp", type=int, help="of differences (default: as many as keep start-up small)")
     args = parser.parse_args()
-    scene_io.use_variant(scene_io.DEFAULT_VARIANT)
+    scene_io.use_variant(args.variant)
+    effort = Effort(args.seconds, args.spp, args.reference_spp)
     mi.set_log_level(mi.LogLevel.Error)
     known = rows.latest(rows.read([args.out])) if args.out.exists() else []
     corpus, bad = Corpus(args.folders, args.most, args.part), 0
@@ -130,8 +147,8 @@ def main() -> int:
         case = case_of(name, param)
         if case in done:
             continue
-        row = measure(corpus, path, param, args.seconds)
-        rows.append(args.out, {**stored(row, case, args.seconds), **rows.circumstances()})
+        row = measure(corpus, path, param, effort)
+        rows.append(args.out, {**stored(row, case, effort), **rows.circumstances()})
         bad += row.word in (WRONG, NOT_FINITE, ERROR)
         gain = "" if row.gain is None or row.stderr is None else f"{row.gain:.3f} +- {row.stderr:.3f}"
         print(f"{case}  {row.word}  {gain}  {row.seconds:.0f} s  {row.reason.partition(chr(10))[0]}", flush=True)

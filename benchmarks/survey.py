@@ -42,6 +42,18 @@ TOLERANCE = 0.05  # of the gain: a few seconds of a noisy scene know no better
 
 
 @dataclass(frozen=True)
+class Effort:
+    """What a check may take: seconds (0: nothing is checked) and samples per pixel of a rendering (None: the default).
+
+    Where renderings are quick and calls are slow, as on a GPU, many samples make the most of the seconds.
+    """
+
+    seconds: float
+    spp: int = 64
+    reference_spp: int | None = None
+
+
+@dataclass(frozen=True)
 class Row:
     scene: str
     param: str
@@ -69,7 +81,7 @@ def survey(folder: Path, seconds: float, most: int | None = None) -> Iterator[Ro
             yield Row(path.name, "", REFUSED, None, None, str(error), time.perf_counter() - start)
             continue
         for info in spread(movable(scene), most):
-            yield row_of(scene, path.name, info, seconds)
+            yield row_of(scene, path.name, info, Effort(seconds))
 
 
 def spread(infos: list[ParamInfo], most: int | None) -> list[ParamInfo]:
@@ -116,7 +128,7 @@ def movable(scene: mi.Scene) -> list[ParamInfo]:
     return found
 
 
-def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
+def row_of(scene: mi.Scene, file: str, info: ParamInfo, effort: Effort) -> Row:
     """Move one thing, and compare if there are seconds for it.
 
     Along the first of `DIRECTIONS` that parts nothing that touches, if there is one: where things touch, a derivative
@@ -140,11 +152,11 @@ def row_of(scene: mi.Scene, file: str, info: ParamInfo, seconds: float) -> Row:
     look = looks[-1] if not looks[-1].parts else looks[0]
     if look.warnings:
         return row(WARNED, look.warnings[0])
-    if seconds == 0:
+    if effort.seconds == 0:
         return row(COMPUTED)
-    check = _checked(scene, info.name, look, seconds)
+    check = _checked(scene, info.name, look, effort)
     if check.verdict.verdict == FAIL:  # a step too large, as where faces turn away from a point of light one by one?
-        check = _checked(scene, info.name, look, seconds, check.eps / FINER)
+        check = _checked(scene, info.name, look, effort, check.eps / FINER)
     verdict = check.verdict
     rejected = integrator_specs.rejected(look.integrator)
     if rejected or not np.isfinite(check.estimate).all():
@@ -193,8 +205,9 @@ def _look(scene: mi.Scene, param: str, how: dict[str, Any]) -> _Look:
     return _Look(how, integrator, missing, sampler.not_finite + pixels)
 
 
-def _checked(scene: mi.Scene, param: str, look: _Look, seconds: float, eps: float | None = None) -> CheckResult:
-    return psdr_jit.check_gradient(scene, param, **look.how, integrator=look.integrator, max_seconds=seconds, eps=eps,
+def _checked(scene: mi.Scene, param: str, look: _Look, effort: Effort, eps: float | None = None) -> CheckResult:
+    return psdr_jit.check_gradient(scene, param, **look.how, integrator=look.integrator, eps=eps,
+                                   max_seconds=effort.seconds, spp=effort.spp, reference_spp=effort.reference_spp,
                                    tolerance=TOLERANCE, max_stderr=TOLERANCE / 2)  # fmt: skip
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from benchmarks import survey_tables
 from benchmarks.public_scenes import Corpus, part_of, stored
-from benchmarks.survey import COMPUTED, REFUSED, UNDECIDED, WARNED, Row
+from benchmarks.survey import COMPUTED, REFUSED, UNDECIDED, WARNED, Effort, Row
 
 
 def made_up(case: str, word: str, reason: str = "", gain: float | None = None, stderr: float | None = None):
     scene, _, param = case.rpartition(": ")
-    return stored(Row(scene, param, word, gain, stderr, reason, 1.0), case, 40.0)
+    return stored(Row(scene, param, word, gain, stderr, reason, 1.0), case, Effort(40.0))
 
 
 def rows():
