@@ -1,7 +1,7 @@
 """Scene files that others have written: what becomes of the things in them that can move, stored as rows.
 
     python -m benchmarks.public_scenes FOLDER...            (hours; append to benchmarks/results/public_scenes.jsonl)
-    python -m benchmarks.public_scenes FOLDER --part 0/2    (every second scene, for two processes side by side)
+    python -m benchmarks.public_scenes FOLDER --part 0/2    (every second one, for two processes side by side)
     python -m benchmarks.public_scenes FOLDER --again       (what is undecided, that known best first)
     python -m benchmarks.public_scenes FOLDER --again --variant cuda_ad_rgb --spp 512 --reference-spp 8192   (on a GPU)
 
@@ -59,7 +59,11 @@ class Corpus:
         found = [(f"{folder.name}/{path.relative_to(folder)}", path)
                  for folder in self.folders for path in sorted(folder.rglob("*.xml"))]  # fmt: skip
         random.Random(ORDER).shuffle(found)
-        return found[self.part[0] :: self.part[1]]
+        return found
+
+    def share(self, things: list) -> list:
+        """Of things that several processes do, those that this one does."""
+        return things[self.part[0] :: self.part[1]]
 
     def names(self, path: Path) -> list[str]:
         """What is moved in a scene; nothing in a file that cannot be loaded, such as a part of others."""
@@ -82,7 +86,7 @@ class Corpus:
         Cameras, lights and shapes, which stand in this order, take turns from scene to scene.
         """
         for turn in range(self.most):
-            for number, (name, path) in enumerate(self.files()):
+            for number, (name, path) in enumerate(self.share(self.files())):
                 chosen = self.names(path)
                 if turn < len(chosen):
                     yield name, path, chosen[(turn + number) % len(chosen)]
@@ -93,7 +97,7 @@ def undecided(corpus: Corpus, known: list[dict[str, Any]]) -> list[tuple[str, Pa
     error = {row["case"]: row["stderr"] or float("inf") for row in known if row["word"] == UNDECIDED}
     found = [(name, path, case.removeprefix(f"{name}: "))
              for name, path in corpus.files() for case in error if case.startswith(f"{name}: ")]  # fmt: skip
-    return sorted(found, key=lambda pair: error[case_of(pair[0], pair[2])])
+    return corpus.share(sorted(found, key=lambda pair: error[case_of(pair[0], pair[2])]))
 
 
 def case_of(name: str, param: str) -> str:
@@ -130,7 +134,7 @@ def main() -> int:
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="limit of a check (default: %(default)g)")
     parser.add_argument("--most", type=int, default=MOST, help="things moved in a scene (default: %(default)s)")
-    parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth scene, from the Kth on")
+    parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth scene, or undecided pair, from the Kth on")
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
     parser.add_argument("--again", action="store_true", help="look at what is undecided once more")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)

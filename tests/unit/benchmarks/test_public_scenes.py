@@ -51,8 +51,8 @@ def test_scenes_take_turns(tmp_path):
     pairs = [(Path(name).name, param) for name, _, param in corpus.pairs()]
     assert {name for name, _ in pairs[:2]} == {"one.xml", "two.xml"} and pairs[2][0] == "one.xml"
     assert sorted(param for _, param in pairs) == ["a", "b", "c"]
-    halves = [[name for name, _ in Corpus([tmp_path], 2, (k, 2)).files()] for k in range(2)]
-    assert [len(half) for half in halves] == [2, 1] and not set(halves[0]) & set(halves[1])
+    halves = [Corpus([tmp_path], 2, (k, 2)).share(files) for k in range(2)]
+    assert halves == [["one.xml", "two.xml"], ["part.xml"]]
 
 
 def test_what_cannot_be_loaded_moves_nothing(llvm, tmp_path, capsys):
