@@ -134,7 +134,7 @@ def main() -> int:
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="limit of a check (default: %(default)g)")
     parser.add_argument("--most", type=int, default=MOST, help="things moved in a scene (default: %(default)s)")
-    parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth scene, or undecided pair, from the Kth on")
+    parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth one, from the Kth on")
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
     parser.add_argument("--again", action="store_true", help="look at what is undecided once more")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)

@@ -99,6 +99,15 @@ def local_viewpoint(columns: tuple[mi.Vector3f, ...], view: mi.Vector4f) -> mi.V
     return mi.Vector4f(x * inv_det, y * inv_det, z * inv_det, view.w)
 
 
+def is_rim(kind: mi.UInt32) -> mi.Bool:
+    """Does the surface end there? At all other curves it turns from the viewer."""
+    return (kind == int(Curve.DISK_RIM)) | is_tube_end(kind)
+
+
+def is_tube_end(kind: mi.UInt32) -> mi.Bool:
+    return (kind == int(Curve.CYLINDER_BOTTOM)) | (kind == int(Curve.CYLINDER_TOP))
+
+
 def curve_centre(kind: mi.UInt32) -> mi.Point3f:
     """A local point inside the shape, from which its contour always exists."""
     on_axis = (kind >= int(Curve.CYLINDER_BOTTOM)) & (kind <= int(Curve.CYLINDER_RIGHT))
@@ -124,7 +133,7 @@ def curve_point(kind: mi.UInt32, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
     rim_z = dr.select(kind == int(Curve.CYLINDER_TOP), 1.0, 0.0)
     x = mi.Point3f(cos, sin, rim_z)
     dx = dr.two_pi * mi.Vector3f(-sin, cos, 0)
-    tube_end = (kind == int(Curve.CYLINDER_BOTTOM)) | (kind == int(Curve.CYLINDER_TOP))
+    tube_end = is_tube_end(kind)
     outward = dr.select(tube_end, mi.Vector3f(0, 0, 2 * rim_z - 1), mi.Vector3f(cos, sin, 0))
     valid = mi.Bool(True)
 
@@ -168,7 +177,7 @@ def own_surface(kind: mi.UInt32, x: mi.Point3f, ω: mi.Vector3f, turn: mi.Float,
     sin, cos = dr.sincos(turn)
     turned = mi.Point3f(x + (cos - 1) * n + sin * towards)
 
-    tube_end = (kind == int(Curve.CYLINDER_BOTTOM)) | (kind == int(Curve.CYLINDER_TOP))
+    tube_end = is_tube_end(kind)
     along_tube = mi.Point3f(x.x, x.y, dr.select(kind == int(Curve.CYLINDER_TOP), 1 - inset, inset))
     on_disk = mi.Point3f(x * (1 - inset))
     return dr.select(tube_end, along_tube, dr.select(kind == int(Curve.DISK_RIM), on_disk, turned))

@@ -15,7 +15,7 @@ lanes that are not `active` may hold any row and are ignored.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import ClassVar, Protocol
 
@@ -26,6 +26,7 @@ from ..core.sensor_frame import SensorFrame, viewpoint
 from .film_cover import LENS_CENTRE, outline_cover
 from .lights import LightBounds
 from .location import EdgeLocation
+from .points import past_lift
 from .wedges import Wedges
 
 
@@ -80,6 +81,11 @@ class Sight:
     @property
     def viewer(self) -> mi.Point3f:
         return self.at.x - self.r * self.ω
+
+    def past_lift(self) -> Sight:
+        """From where rays that Mitsuba starts beside the edge are clear of the shape: see `points.past_lift`."""
+        offset, lead = past_lift(self.at.x, self.offset, self.lead, self.r)
+        return replace(self, offset=offset, lead=lead)
 
     def beside(self, which: mi.UInt32) -> mi.Ray3f:
         """The ray that passes the edge on side `which`: 0 towards −n_perp, 1 towards +n_perp."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +15,7 @@ from .curves import (
     curve_lengths,
     curve_point,
     curve_scale,
+    is_rim,
     local_viewpoint,
     own_surface,
     transform_point,
@@ -22,7 +23,7 @@ from .curves import (
 )
 from .kind import ContourKind, OnEdge, Side, Sight, Use
 from .location import EdgeLocation
-from .points import INSET, VISIBILITY_EPSILON, clearance, step_past_lift
+from .points import INSET, VISIBILITY_EPSILON, clearance
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,11 @@ class AnalyticCurves(ContourKind):
         )
 
     def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
-        """A ray aimed at a tangent point meets the shape itself: beside it."""
-        return sight.at.x + VISIBILITY_EPSILON * sight.at.scale * sight.n_perp
+        """A ray aimed at a tangent point meets the shape itself: beside it. At a rim it does not, and beside the foot
+        of a tube there may be a floor.
+        """
+        rim = is_rim(dr.gather(mi.UInt32, self.curves.rows.kind, row, active))
+        return sight.at.x + dr.select(rim, 0, VISIBILITY_EPSILON * sight.at.scale) * sight.n_perp
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """The shape itself on the side −n_perp, and whatever a ray meets on the other.
@@ -93,8 +97,7 @@ class AnalyticCurves(ContourKind):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.shape = dr.gather(mi.ShapePtr, self.curves.pointers, rows.shape, pi.valid)
         pi.prim_uv = mi.Point2f(local.x, local.y)  # of a disk; the others ask for the point alone
-        past = replace(sight, offset=step_past_lift(at.x, sight.offset, sight.r))
-        beside = past.beside(which)
+        beside = sight.past_lift().beside(which)
         ray = mi.Ray3f(dr.select(own, transform_point(columns, local) - sight.r * sight.ω, beside.o), beside.d)
         return Side(ray, pi, ~own, own, mi.Bool(True))
 

@@ -14,7 +14,7 @@ from .joined_meshes import attached_positions
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import VISIBILITY_EPSILON, clearance, face_sides, step_past_lift
+from .points import VISIBILITY_EPSILON, clearance, face_sides
 from .rows import EdgeRows, face_uv
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
 
@@ -96,7 +96,7 @@ class MeshEdges(BetweenFaces):
         any offset. With b_i the direction into face i, face i lies on side sign(b_i · n_perp) (`face_sides`); two faces
         on the same side are a silhouette, of which the one nearer to the viewer is seen. A face seen edge-on is on
         neither side: the other face, if there is one, then ends at a silhouette. What silhouettes hide right behind
-        them is looked at clear of where Mitsuba starts rays (`step_past_lift`).
+        them is looked at clear of where Mitsuba starts rays (`past_lift`).
         """
         rows = dr.gather(EdgeRows, self.rows, row, active)
         τ = dr.normalize(rows.p1 - rows.p0)
@@ -113,8 +113,8 @@ class MeshEdges(BetweenFaces):
         pi = self._face(rows, use1, sight, face & active)
         beside = sight.beside(which)
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
-        past = step_past_lift(sight.at.x, sight.offset, sight.r) - sight.offset
-        aside = dr.select(silhouette & ~rows.traced & ~face, towards * past * sight.n_perp, 0)
+        farther = mi.Vector3f(sight.past_lift().beside(which).o - beside.o)
+        aside = dr.select(silhouette & ~rows.traced & ~face, farther, 0)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
         differs = in_view & (rows.border | silhouette | rows.seam) | rows.traced

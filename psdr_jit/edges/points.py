@@ -62,13 +62,15 @@ def clear_of_lift(x: mi.Point3f) -> mi.Float:
     return CLEAR_OF_LIFT * start_height(x)
 
 
-def step_past_lift(x: mi.Point3f, offset: mi.Float, r: mi.Float) -> mi.Float:
-    """Sideways distance, `offset` or more, at which what an outline at `x` hides is looked at from the distance r [m].
+def past_lift(x: mi.Point3f, offset: mi.Float, lead: mi.Float, r: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """`offset` and `lead`, or more, with which what an outline at `x` hides is looked at from the distance r [m].
 
     Where the shape cuts into another, what it hides begins beside its outline. Rays that Mitsuba starts nearer to the
-    outline than its height start inside of the shape, in the dark.
+    outline than its height start inside of the shape, in the dark. What the shape stands on is looked at from above
+    by rays that start as much farther in front as they pass farther aside.
     """
-    return dr.maximum(offset, dr.minimum(clear_of_lift(x), LARGEST_STEP * r))
+    farther = dr.maximum(0, dr.minimum(clear_of_lift(x), LARGEST_STEP * r) - offset)
+    return offset + farther, lead + LEAD * farther
 
 
 def face_inset(p0: mi.Point3f, p1: mi.Point3f, apex: mi.Point3f, n0: mi.Normal3f, n1: mi.Normal3f) -> mi.Float:
