@@ -50,7 +50,8 @@ class SmoothLights:
         """
         R, ρ = self._share(si, bsdf, light, ω, active)
         ρ = dr.detach(ρ)
-        return R * ρ / (1 + mis * (dr.square(ρ) - 1)) if self.alone else R / ρ
+        # in this order: the sum is ρ² where the weight is 1, and no less however small that is
+        return R * ρ / ((1 - mis) + mis * dr.square(ρ)) if self.alone else R / ρ
 
     def of_ray(self, si, bsdf: mi.BSDFPtr, light, ω: mi.Vector3f, mis: mi.Float, active: mi.Bool) -> mi.Float:
         """The same for what a sampled direction meets."""
