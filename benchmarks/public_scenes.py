@@ -2,7 +2,7 @@
 
     python -m benchmarks.public_scenes FOLDER...            (hours; append to benchmarks/results/public_scenes.jsonl)
     python -m benchmarks.public_scenes FOLDER --part 0/2    (every second one, for two processes side by side)
-    python -m benchmarks.public_scenes FOLDER --again       (what is undecided, that known best first)
+    python -m benchmarks.public_scenes FOLDER --again       (what went wrong, then what is undecided)
     python -m benchmarks.public_scenes FOLDER --again --variant cuda_ad_rgb --spp 512 --reference-spp 8192   (on a GPU)
 
 Each thing is moved a little, and compared with differences for so many seconds. What has a row is not done again. The
@@ -93,8 +93,9 @@ class Corpus:
 
 
 def undecided(corpus: Corpus, known: list[dict[str, Any]]) -> list[tuple[str, Path, str]]:
-    """Of the pairs that have rows, those without a verdict, by the error of their gain."""
+    """Of the pairs that have rows, those that went wrong, then those without a verdict by the error of their gain."""
     error = {row["case"]: row["stderr"] or float("inf") for row in known if row["word"] == UNDECIDED}
+    error |= {row["case"]: 0.0 for row in known if row["word"] in (WRONG, NOT_FINITE, ERROR)}
     found = [(name, path, case.removeprefix(f"{name}: "))
              for name, path in corpus.files() for case in error if case.startswith(f"{name}: ")]  # fmt: skip
     return corpus.share(sorted(found, key=lambda pair: error[case_of(pair[0], pair[2])]))
@@ -136,7 +137,7 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=MOST, help="things moved in a scene (default: %(default)s)")
     parser.add_argument("--part", type=part_of, default=(0, 1), metavar="K/N", help="every Nth one, from the Kth on")
     parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
-    parser.add_argument("--again", action="store_true", help="look at what is undecided once more")
+    parser.add_argument("--again", action="store_true", help="look at what is undecided, or went wrong, once more")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
     parser.add_argument("--spp", type=int, default=Effort.spp, help="of an estimate (default: %(default)s)")
     parser.add_argument("--reference-spp", type=int, help="of differences (default: as many as keep start-up small)")
