@@ -16,6 +16,7 @@ class Sweep:
     values: Sequence[float]
     step: Callable[[float], Any]
     one_truth: Any = None  # every step has the derivative of this case
+    largest_step: Callable[[float], float] | None = None  # of differences, where the default is coarse [scene units]
 
 
 def case_name(sweep: Sweep, value: float) -> str:
