@@ -6,7 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from fuzz.meshes import MESHES
+from fuzz.meshes import MESHES, in_four
 
 UV = np.array([[0.5, 0.1], [0.13, 0.21], [0.07, 0.5]])  # texture coordinates of a mesh: a slanted projection
 RAW = {"raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
@@ -46,8 +46,10 @@ def _pose(steps: list) -> mi.ScalarTransform4f:
 
 
 def _mesh(item: dict[str, Any]) -> mi.Mesh:
-    """A mesh by name; Mitsuba computes the normals of a smooth one."""
+    """A mesh by name; Mitsuba computes the normals of a smooth one. `divided`: each face into four."""
     points, faces = MESHES[item["mesh"]](item["segments"])
+    if item.get("divided"):
+        points, faces = in_four(points, faces)
     uv = points @ UV[:, :2] + 0.5
     matrix = np.array(item["to_world"].matrix, dtype=float)
     points = points @ matrix[:3, :3].T + matrix[:3, 3]

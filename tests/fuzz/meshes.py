@@ -70,6 +70,22 @@ def tent(_: int) -> Arrays:
     return points, np.array([[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]])
 
 
-MESHES: dict[str, Callable[[int], Arrays]] = {f.__name__: f for f in (ball, torus, box, prism, sheet, tent)}
+def in_four(points: np.ndarray, faces: np.ndarray) -> Arrays:
+    """The same surface of four times as many faces."""
+    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    sides, middle = np.unique(sides, axis=0, return_inverse=True)
+    m = len(points) + middle.reshape(-1, 3)
+    a, b, c = faces.T
+    small = np.concatenate([np.stack(corners, 1) for corners in (
+        (a, m[:, 0], m[:, 2]), (m[:, 0], b, m[:, 1]), (m[:, 2], m[:, 1], c), (m[:, 0], m[:, 1], m[:, 2]))])
+    return np.concatenate([points, points[sides].mean(1)]), small
+
+
+def square(_: int) -> Arrays:
+    """What Mitsuba's `rectangle` is."""
+    return np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+MESHES: dict[str, Callable[[int], Arrays]] = {f.__name__: f for f in (ball, torus, box, prism, sheet, tent, square)}
 CLOSED = ("ball", "torus", "box", "prism")
 OPEN = ("sheet", "tent")

@@ -1,0 +1,60 @@
+"""Random scenes and what looks the same: as many seeds as `PSDR_FUZZ_SEEDS` says, from `PSDR_FUZZ_FIRST` on."""
+
+from __future__ import annotations
+
+import os
+from copy import deepcopy
+
+import pytest
+from fuzz.alike import WAYS, compare
+from fuzz.build import build
+from fuzz.scenes import Case, case_of
+from fuzz.verdict import VARIANT, WRONG
+from variants import activate
+
+from psdr_jit.scene.params import find_param
+
+FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
+COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "10"))
+LOADED = 60  # seeds of the quick test
+WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
+
+
+@pytest.fixture
+def mono() -> str:
+    return activate(VARIANT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
+@pytest.mark.parametrize("way", WAYS)
+def test_what_looks_the_same_is_derived_alike(mono, way, seed):
+    outcome = compare(case_of(seed), WAYS[way])
+    assert outcome is None or not outcome.failed, outcome.text
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_scenes_written_anew_load(mono, way):
+    """And there are some, for every way."""
+    pairs = 0
+    for seed in range(LOADED):
+        changed = WAYS[way](deepcopy(case_of(seed)))
+        if changed is not None:
+            other, factor = changed
+            assert find_param(build(other["scene"]), other["param"]).differentiable and factor > 0
+            pairs += 1
+        if pairs == 3:
+            return
+    assert pairs > 0
+
+
+@pytest.mark.slow
+def test_a_missing_term_is_found(mono):
+    """The comparison can fail: without the outlines that the sensor sees, another scene is another one."""
+
+    def without_outlines(case: Case) -> tuple[Case, float]:
+        other = deepcopy(case)
+        other["integrator"] |= {"sppc": 1, "sppp": 0, "sppd": 1, "sppi": 1}
+        return other, 1.0
+
+    assert compare(case_of(WITH_OUTLINES), without_outlines).word == WRONG
