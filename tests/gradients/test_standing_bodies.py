@@ -13,6 +13,7 @@ from helpers import forward, mesh_of
 from psdr_jit.derivative.perturbation import perturb
 
 SPP, SEEDS = 256, 4
+MIRROR = 2.6  # its place along z, between the camera and the body [units]
 ELEVATIONS = (40.0, 8.0, 2.0)  # of the camera [degrees]
 
 
@@ -28,11 +29,16 @@ def standing(what: str, unit: float, foot: float) -> object:
     return mesh_of(unit * turned, faces, bsdf=black)
 
 
-def room(what: str, unit: float, elevation: float, foot: float) -> mi.Scene:
-    """It stands on a floor that shines, of which nothing else is seen."""
+def room(what: str, unit: float, elevation: float, foot: float, mirrored: bool = False) -> mi.Scene:
+    """It stands on a floor that shines, of which nothing else is seen, directly or in a mirror."""
     angle = np.radians(elevation)
     origin = unit * np.array([0.1, 4 * np.sin(angle), 4 * np.cos(angle)])
     target, up = unit * np.array([0.05, 0.02, 0.3]), [0, 1, 0]
+    there = mi.ScalarTransform4f().translate([0, 0, MIRROR * unit]).rotate(up, 180).scale(3 * unit)
+    mirror = {"type": "rectangle", "to_world": there, "bsdf": {"type": "conductor", "material": "none"}}
+    if mirrored:
+        for x in (origin, target):
+            x[2] = 2 * MIRROR * unit - x[2]
     pose = mi.ScalarTransform4f().look_at(list(origin), list(target), up)
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     flat = mi.ScalarTransform4f().rotate((1, 0, 0), -90).scale(6 * unit)
@@ -40,12 +46,13 @@ def room(what: str, unit: float, elevation: float, foot: float) -> mi.Scene:
         "type": "scene", "body": standing(what, unit, foot),
         "floor": {"type": "rectangle", "to_world": flat, "light": {"type": "area", "radiance": 1.0}},
         "sensor": {"type": "perspective", "fov": 8, "to_world": pose, "film": film},
+        **({"mirror": mirror} if mirrored else {}),
     }, optimize=False)  # fmt: skip
 
 
-def derivative(scene: mi.Scene, unit: float) -> np.ndarray:
-    """Of the image, in units of the scene's size, as the camera moves aside and up."""
-    motion = perturb(scene, "sensor.to_world", (0.3, 1, 0))
+def derivative(scene: mi.Scene, unit: float, param: str, direction: tuple[float, float, float]) -> np.ndarray:
+    """Of the image, in units of the scene's size."""
+    motion = perturb(scene, param, direction)
     return unit * forward(motion, {"type": "psdr_path", "max_depth": 2}, SEEDS, SPP).mean(0)
 
 
@@ -53,7 +60,19 @@ def derivative(scene: mi.Scene, unit: float) -> np.ndarray:
 @pytest.mark.parametrize("unit", [0.5, 1.0, 500.0])
 @pytest.mark.parametrize("what", ["box", "tube"])
 def test_a_foot_is_seen_against_the_floor(llvm, what, unit, elevation):
-    on_it, sunk = (derivative(room(what, unit, elevation, foot), unit) for foot in (0.0, -0.5))
+    moved = ("sensor.to_world", (0.3, 1, 0))
+    on_it, sunk = (derivative(room(what, unit, elevation, foot), unit, *moved) for foot in (0.0, -0.5))
     size = np.sqrt(np.mean(sunk**2))
     assert size > 0.1
     assert np.abs(on_it - sunk).max() < 0.02 * size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("elevation", ELEVATIONS)
+@pytest.mark.parametrize("what", ["box", "tube"])
+def test_and_so_it_is_in_a_mirror(llvm, what, elevation):
+    moved = ("body.vertex_positions" if what == "box" else "body.to_world", (1, 0, 0.5))
+    on_it, sunk = (derivative(room(what, 1.0, elevation, foot, True), 1.0, *moved) for foot in (0.0, -0.5))
+    size = np.sqrt(np.mean(sunk**2))
+    assert size > 0.1
+    assert np.abs(on_it - sunk).max() < 0.03 * size
