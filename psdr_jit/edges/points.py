@@ -37,6 +37,10 @@ LARGEST_STEP = 1e-3
 #: Sine of the angle to its plane below which a face is seen edge-on: sixteen units in the last place of a direction.
 EDGE_ON = 1e-6
 
+#: Cosine below which a visibility ray along a face is so near to it, until it ends, that it may meet it by rounding: at
+#: 1.3e-4 a third do (a quad of a ball of 32 000 faces, 5 % of a pixel), at 2e-3 none.
+NEARLY_EDGE_ON = 1e-3
+
 #: Share of the distance to the edge that a visibility ray leaves out.
 VISIBILITY_EPSILON = 1e-4
 
