@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.sensor_frame import SensorFrame
 from .curves import (
     PIECES,
     CurveRows,
@@ -32,6 +33,8 @@ class AnalyticCurves(ContourKind):
 
     curves: CurveSet
     moves: mi.Bool  # by row: can its shape move?
+    closed: mi.Bool  # by row: is it a rim that a disk closes? What lies beside it is traced
+    closing: mi.Bool  # by row: the rim of such a disk, which is left out
     centre: mi.Point3f  # of the scene
 
     @property
@@ -45,7 +48,10 @@ class AnalyticCurves(ContourKind):
         return mi.Point3f(self.curves.poses.at(self.curves.rows.shape)[3])
 
     def line_weights(self, use: Use) -> mi.Float:
-        return curve_lengths(self.curves) * dr.pi
+        return dr.select(self.closing, 0, curve_lengths(self.curves) * dr.pi)
+
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        return dr.select(self.closing, 0, super().film_weights(frame, border))
 
     def _columns(self, row: mi.UInt32, active: mi.Bool) -> tuple[CurveRows, tuple[mi.Vector3f, ...]]:
         """The rows, and the columns of their shapes' object-to-world maps, detached."""
@@ -86,7 +92,7 @@ class AnalyticCurves(ContourKind):
         The shape is never shot at: a ray that passes an outline on its inner side touches the surface, and unless it
         starts well outside of the bulge it meets the far wall instead.
         """
-        own = which == 0
+        own = (which == 0) & ~dr.gather(mi.Bool, self.closed, row, active)
         rows, columns = self._columns(row, active)
         at = sight.at
         ω = local_viewpoint(columns, mi.Vector4f(sight.ω.x, sight.ω.y, sight.ω.z, 0))

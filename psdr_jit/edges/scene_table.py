@@ -24,6 +24,7 @@ from ..scene.facts import ShapeFacts
 from ..scene.grids import VALUES, blends_normals
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
+from .capped import joined_rims
 from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
 from .contact_limits import touching, warn_about_contacts
 from .contact_motion import warn_about_parting
@@ -262,4 +263,5 @@ def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> Analy
     if curves.rows is None:
         return None
     moves = np.concatenate([np.full(len(CURVES_OF[s.plugin]) * PIECES, s.moves) for s in analytic])
-    return AnalyticCurves(curves, uploaded(mi.Bool, moves), centre)
+    closed, closing = joined_rims(curves, [s.plugin for s in analytic], [s.moves for s in analytic])
+    return AnalyticCurves(curves, *(uploaded(mi.Bool, column) for column in (moves, closed, closing)), centre)
