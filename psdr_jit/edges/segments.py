@@ -22,6 +22,7 @@ from ..errors import SceneError, UnsupportedWarning
 from ..scene.names import shown_name
 from .coinciding import PointsBetween, divided, join_coinciding
 from .contacts import Contact, find_contacts
+from .flush_faces import trace_in_flush_faces
 from .geometry import EdgeTopologyDevice, edge_geometry, upload_topology
 from .joined_meshes import JoinedTopology, attached_positions, joined_faces, joined_topology
 from .junctions import JunctionTable, find_junctions
@@ -101,6 +102,7 @@ def edge_set(
     contacts = find_contacts(solids, memory)
     rows = _rows(meshes, topologies, joined(jumps), moving, memory)
     vertices = sum(mesh.vertex_count() for mesh in meshes)
+    trace_in_flush_faces(rows, solids, contacts)
     rows, between, shared = divided(rows, solids, contacts, vertices)
     rows = join_coinciding(rows, moving, shared)
     junctions = find_junctions(solids, balls, memory)

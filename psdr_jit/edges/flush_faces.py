@@ -1,0 +1,54 @@
+"""Edges that lie in a face of another body which looks the same way: boards that reach into a post, flush in front.
+
+Of such an edge one face goes on as the other body's, and the other lies inside of it: what is known of them is not what
+is seen there. Both sides are traced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.upload import uploaded
+from .contacts import FLAT, Contact
+from .intersections import TriangleMesh
+from .rows import EdgeRows
+from .solids import Solid, triangles
+from .topology import INVALID
+from .touching import Resting
+
+
+def trace_in_flush_faces(rows: EdgeRows, solids: Sequence[Solid], contacts: Sequence[Contact]) -> None:
+    """Mark such rows, in place: one for each edge of `solids`, in order. Of bodies that both move or both rest."""
+    first = np.cumsum([0] + [len(solid.topology) for solid in solids])
+    found: set[int] = set()
+    for contact in contacts:
+        if contact.a.moves != contact.b.moves:
+            continue
+        for own, other, resting in ((contact.a, contact.b, contact.a_in_b), (contact.b, contact.a, contact.b_in_a)):
+            if len(resting.edge):
+                edges = _alike(triangles(own), triangles(other), resting)
+                found.update((first[own.index] + edges).tolist())
+    if found:
+        dr.eval(rows.traced)
+        dr.scatter(rows.traced, mi.Bool(True), uploaded(mi.UInt32, np.array(sorted(found), np.uint32)))
+
+
+def _alike(own: TriangleMesh, other: TriangleMesh, resting: Resting) -> np.ndarray:
+    """The edges of which a face looks the same way as the face in which they rest."""
+    there = _normals(other, resting.face)
+    same = np.zeros(len(resting.edge), bool)
+    for face in own.edge_faces[resting.edge].T:
+        here = _normals(own, np.where(face == INVALID, 0, face))
+        turned = np.linalg.norm(np.cross(here, there), axis=1)
+        same |= (face != INVALID) & (turned < FLAT) & (np.sum(here * there, axis=1) > 0)
+    return resting.edge[same]
+
+
+def _normals(mesh: TriangleMesh, face: np.ndarray) -> np.ndarray:
+    p, q, r = np.moveaxis(mesh.positions[mesh.faces[face]].astype(float), 1, 0)
+    n = np.cross(q - p, r - p)
+    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(float).tiny)
