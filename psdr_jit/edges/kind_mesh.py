@@ -14,7 +14,7 @@ from .joined_meshes import attached_positions
 from .kind import FixedKind, OnEdge, Side, Sight, Use
 from .lights import LightBounds, may_cast_shadow
 from .location import EdgeLocation
-from .points import NEARLY_EDGE_ON, clearance, face_sides
+from .points import CLEARLY_SEEN, NEARLY_EDGE_ON, clearance, face_sides
 from .rows import EdgeRows, face_uv
 from .wedges import Wedges, crease_relevance, silhouette_wedges, step_wedges
 
@@ -131,8 +131,9 @@ class MeshEdges(BetweenFaces):
         border = dr.gather(mi.Bool, self.rows.border, row, active)
         a0, a1 = face_sides(n0, n1, sight.ω)
         one = ~border & ((a0 == 0) ^ (a1 == 0))
+        onto = one & (dr.abs(a0 + a1) > CLEARLY_SEEN)
         past = ~border & (a0 * a1 > 0) & (dr.minimum(dr.abs(a0), dr.abs(a1)) < NEARLY_EDGE_ON)
-        towards = dr.select(one, 1.0, dr.select(past, -1.0, 0.0))
+        towards = dr.select(onto, 1.0, dr.select(one | past, -1.0, 0.0))
         return sight.at.x + towards * dr.sign(a0 + a1) * sight.offset * sight.n_perp
 
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:

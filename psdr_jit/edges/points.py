@@ -41,6 +41,9 @@ EDGE_ON = 1e-6
 #: 1.3e-4 a third do (a quad of a ball of 32 000 faces, 5 % of a pixel), at 2e-3 none.
 NEARLY_EDGE_ON = 1e-3
 
+#: Cosine above which a face hides no more of a ray aimed at it, beside its edge, than such a ray leaves out.
+CLEARLY_SEEN = 2e-2
+
 #: Share of the distance to the edge that a visibility ray leaves out.
 VISIBILITY_EPSILON = 1e-4
 
