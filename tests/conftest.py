@@ -28,3 +28,9 @@ def variant(request) -> str:
 def llvm() -> str:
     """RGB on the CPU, for what does not depend on the backend (or by PSDR_TEST_BACKEND, see `variants`)."""
     return activate("llvm_ad_rgb")
+
+
+@pytest.fixture
+def mono() -> str:
+    """Half the work of RGB; what moves is the same."""
+    return activate("llvm_ad_mono")

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.joining import starts
 from ..core.upload import uploaded
 from .contacts import Contact
 from .rows import EdgeRows
@@ -51,7 +52,7 @@ def divided(
     `ends`: new ends of rows, numbered after the `vertices`; None if nothing is divided. `shared`: rows that may
     coincide with others. Only edges that all move, or all rest, are divided: see `join_coinciding`.
     """
-    first = np.cumsum([0] + [len(solid.topology) for solid in solids])
+    first = starts([len(solid.topology) for solid in solids])
     cuts: dict[int, dict[float, tuple[int, int]]] = {}  # by row: parameters, and the row and end that lies there
     shared: set[int] = set()
     for contact in contacts:

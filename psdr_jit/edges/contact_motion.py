@@ -18,7 +18,7 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.names import shown_name
 from .contacts import Contact
-from .intersections import TriangleMesh, barycentric
+from .intersections import TriangleMesh, barycentric, unit_normals
 from .solids import Solid, triangles
 from .touching import Resting
 
@@ -89,9 +89,8 @@ def _off_faces(
     own: TriangleMesh, v: np.ndarray, other: TriangleMesh, v_other: np.ndarray, found: Resting
 ) -> np.ndarray:
     """Speeds at which the ends of stretches leave the faces that they lie in."""
-    corners = other.positions[other.faces[found.face]].astype(float)
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    corners = other.corners(found.face)
+    n = unit_normals(corners)
     speeds = []
     for k in range(2):
         x = _on_edges(own, own.positions, found.edge, found.on_edge[:, k])

@@ -116,11 +116,7 @@ def _ends(mesh: cut.TriangleMesh, edges: np.ndarray) -> np.ndarray:
 
 def _seen(mesh: cut.TriangleMesh, edges: np.ndarray) -> np.ndarray:
     """Those of `edges` that are borders, or at which the surface has an angle."""
-    normals = []
-    for side in mesh.edge_faces[edges].T:
-        p, q, r = np.moveaxis(mesh.positions[mesh.faces[np.where(side == INVALID, 0, side)]].astype(float), 1, 0)
-        n = np.cross(q - p, r - p)
-        normals.append(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300))
+    normals = [cut.unit_normals(mesh.corners(np.where(side == INVALID, 0, side))) for side in mesh.edge_faces[edges].T]
     bent = np.linalg.norm(np.cross(*normals), axis=1) > FLAT
     folded = np.sum(normals[0] * normals[1], axis=1) < 0
     return edges[bent | folded | (mesh.edge_faces[edges, 1] == INVALID)]

@@ -12,9 +12,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.joining import starts
 from ..core.upload import uploaded
 from .contacts import FLAT, Contact
-from .intersections import TriangleMesh
+from .intersections import TriangleMesh, unit_normals
 from .rows import EdgeRows
 from .solids import Solid, triangles
 from .topology import INVALID
@@ -23,7 +24,7 @@ from .touching import Resting
 
 def trace_in_flush_faces(rows: EdgeRows, solids: Sequence[Solid], contacts: Sequence[Contact]) -> None:
     """Mark such rows, in place: one for each edge of `solids`, in order. Of bodies that both move or both rest."""
-    first = np.cumsum([0] + [len(solid.topology) for solid in solids])
+    first = starts([len(solid.topology) for solid in solids])
     found: set[int] = set()
     for contact in contacts:
         if contact.a.moves != contact.b.moves:
@@ -39,16 +40,10 @@ def trace_in_flush_faces(rows: EdgeRows, solids: Sequence[Solid], contacts: Sequ
 
 def _alike(own: TriangleMesh, other: TriangleMesh, resting: Resting) -> np.ndarray:
     """The edges of which a face looks the same way as the face in which they rest."""
-    there = _normals(other, resting.face)
+    there = unit_normals(other.corners(resting.face))
     same = np.zeros(len(resting.edge), bool)
     for face in own.edge_faces[resting.edge].T:
-        here = _normals(own, np.where(face == INVALID, 0, face))
+        here = unit_normals(own.corners(np.where(face == INVALID, 0, face)))
         turned = np.linalg.norm(np.cross(here, there), axis=1)
         same |= (face != INVALID) & (turned < FLAT) & (np.sum(here * there, axis=1) > 0)
     return resting.edge[same]
-
-
-def _normals(mesh: TriangleMesh, face: np.ndarray) -> np.ndarray:
-    p, q, r = np.moveaxis(mesh.positions[mesh.faces[face]].astype(float), 1, 0)
-    n = np.cross(q - p, r - p)
-    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -48,6 +48,16 @@ class TriangleMesh:
     def box(self) -> np.ndarray:
         return np.array([[column.min(), column.max()] for column in self.positions.T]).T
 
+    def corners(self, face: np.ndarray) -> np.ndarray:
+        """Of faces with these numbers (N,), in double precision (N, 3, 3)."""
+        return self.positions[self.faces[face]].astype(float)
+
+
+def unit_normals(corners: np.ndarray) -> np.ndarray:
+    """Of triangles (N, 3, 3), by their winding; 0 where they have no area."""
+    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+
 
 @dataclass(frozen=True)
 class Segments:
@@ -133,10 +143,8 @@ def _pierced(own: TriangleMesh, other: TriangleMesh, box: np.ndarray, tol: float
 
 def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
     """All pairs (segment, triangle) that cross: `(segment, triangle, point)`. An end in the plane is no crossing."""
-    p, q, r = corners[:, 0], corners[:, 1], corners[:, 2]
-    n = np.cross(q - p, r - p)
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
-    level = np.einsum("ij,ij->i", n, p)
+    n = unit_normals(corners)
+    level = np.einsum("ij,ij->i", n, corners[:, 0])
     d0, d1 = (ends[:, k] @ n.T - level for k in (0, 1))
     e, f = np.nonzero((d0 * d1 < 0) & (np.minimum(np.abs(d0), np.abs(d1)) > tol))
     t = d0[e, f] / (d0[e, f] - d1[e, f])
@@ -148,8 +156,7 @@ def _crossings(ends: np.ndarray, corners: np.ndarray, tol: float):
 
 def _near_crossings(ends: np.ndarray, corners: np.ndarray, tol: float, most_parts: int | None = None):
     """The same for many segments and triangles: only pairs whose boxes overlap are tested."""
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    n = unit_normals(corners)
     level = np.einsum("ij,ij->i", n, corners[:, 0])
     found, tests = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))], 0
     for part, (e, f) in enumerate(near_pairs(ends.min(1), ends.max(1), corners.min(1), corners.max(1))):

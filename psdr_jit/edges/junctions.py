@@ -199,9 +199,8 @@ def _between(a: Solid, mesh_a: cut.TriangleMesh, b: Solid, mesh_b: cut.TriangleM
 
 
 def _sheet(solid: Solid, mesh: cut.TriangleMesh, face: np.ndarray, start: np.ndarray, end: np.ndarray) -> dict:
-    corners = mesh.positions[mesh.faces[face]].astype(float)
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    corners = mesh.corners(face)
+    n = cut.unit_normals(corners)
     shells = np.zeros(len(mesh.faces))
     shells[solid.topology.f0] = np.array(solid.shell)
     border = solid.topology.border

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .intersections import unit_normals
 from .near_pairs import near_pairs
 
 #: Shortest common part of two edges, or of an edge and a face, in units of the distance that counts as touching.
@@ -58,8 +59,7 @@ def shared_parts(a: np.ndarray, b: np.ndarray, tol: float) -> Shared:
 
 def parts_in_faces(edges: np.ndarray, corners: np.ndarray, tol: float) -> Resting:
     """Stretches of segments (N, 2, 3) that lie in triangles (M, 3, 3), their borders included."""
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    n = unit_normals(corners)
     found = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))]
     for i, f in _near(edges, corners, tol):
         height = np.abs(_dot(edges[i] - corners[f][:, :1], n[f][:, None])).max(1)

@@ -50,8 +50,7 @@ class SmoothLights:
         """
         R, ρ = self._share(si, bsdf, light, ω, active)
         ρ = dr.detach(ρ)
-        # in this order: the sum is ρ² where the weight is 1, and no less however small that is
-        return R * ρ / ((1 - mis) + mis * dr.square(ρ)) if self.alone else R / ρ
+        return shared_by_sample(R, ρ, mis) if self.alone else R / ρ
 
     def of_ray(self, si, bsdf: mi.BSDFPtr, light, ω: mi.Vector3f, mis: mi.Float, active: mi.Bool) -> mi.Float:
         """The same for what a sampled direction meets."""
@@ -68,6 +67,12 @@ class SmoothLights:
         b2 = dr.square(bsdf.pdf(mi.BSDFContext(), si, si.to_local(ω), usable))
         usable &= b2 + e2 > 0
         return dr.select(usable, (b2 + ρ * e2) / dr.select(usable, b2 + e2, 1), 1), ρ
+
+
+def shared_by_sample(R: mi.Float, ρ: mi.Float, mis: mi.Float) -> mi.Float:
+    """The part of R that a light sample with the weight `mis` brings, by true densities."""
+    # in this order: the sum is ρ² where the weight is 1, and no less however small that is
+    return R * ρ / ((1 - mis) + mis * dr.square(ρ))
 
 
 def pdf_of_sample(scene: mi.Scene, it: mi.Interaction3f, light, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:

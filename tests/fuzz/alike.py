@@ -17,7 +17,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from fuzz.build import build
+from fuzz.build import build, pose_of
 from fuzz.scenes import Case, case_of
 from fuzz.verdict import BLOCK, NOISY, REFUSED, RIGHT, SURE, TOLERANCE, VARIANT, WARNED, WRONG, Outcome
 
@@ -84,9 +84,7 @@ def turned(case: Case) -> tuple[Case, float] | None:
     if "index" in case["how"] or ("rotate" in case["how"] and case["param"].endswith(".vertex_positions")):
         return None
     case = deepcopy(case)
-    axis = (np.array(TURN[1]) / np.linalg.norm(TURN[1])).tolist()
-    pose = mi.ScalarTransform4f().translate(SHIFT[1]).rotate(axis, TURN[2])
-    matrix = np.array(pose.matrix, dtype=float)
+    matrix = np.array(pose_of([SHIFT, TURN]).matrix, dtype=float)
     point = lambda x: (matrix[:3, :3] @ np.array(x, dtype=float) + matrix[:3, 3]).tolist()  # noqa: E731
     vector = lambda x: (matrix[:3, :3] @ np.array(x, dtype=float)).tolist()  # noqa: E731
     for item in _placed(case):

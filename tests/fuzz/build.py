@@ -21,7 +21,7 @@ def _resolved(item: dict[str, Any]) -> Any:
     """What `mi.load_dict` takes, of one object and all that it holds."""
     made = {key: _resolved(value) if isinstance(value, dict) else value for key, value in item.items()}
     if "to_world" in made:
-        made["to_world"] = _pose(made["to_world"])
+        made["to_world"] = pose_of(made["to_world"])
     if "texels" in made:
         grey = np.array(made.pop("texels"), dtype=np.float32)
         if made["type"] == "envmap":
@@ -30,7 +30,7 @@ def _resolved(item: dict[str, Any]) -> Any:
     return _mesh(made) if made["type"] == "mesh" else made
 
 
-def _pose(steps: list) -> mi.ScalarTransform4f:
+def pose_of(steps: list) -> mi.ScalarTransform4f:
     """The product of the steps, the last of which is applied first."""
     pose = mi.ScalarTransform4f()
     for name, *numbers in steps:

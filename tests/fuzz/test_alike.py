@@ -9,8 +9,7 @@ import pytest
 from fuzz.alike import WAYS, compare
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
-from fuzz.verdict import VARIANT, WRONG
-from variants import activate
+from fuzz.verdict import WRONG
 
 from psdr_jit.scene.params import find_param
 
@@ -18,11 +17,6 @@ FIRST = int(os.environ.get("PSDR_FUZZ_FIRST", "0"))
 COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "10"))
 LOADED = 60  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
-
-
-@pytest.fixture
-def mono() -> str:
-    return activate(VARIANT)
 
 
 @pytest.mark.slow

@@ -14,8 +14,7 @@ from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
 from fuzz.specular import bidirectional_case_of, specular_case_of
-from fuzz.verdict import NOISY, RIGHT, VARIANT, WRONG, Effort, Look, Outcome, examine
-from variants import activate
+from fuzz.verdict import NOISY, RIGHT, WRONG, Effort, Look, Outcome, examine
 
 from psdr_jit.derivative.statistics import Gain
 from psdr_jit.scene.params import find_param
@@ -29,12 +28,6 @@ SHRINK_SECONDS = 180.0
 FOUND = (461, 509, 544, 704, 2082, 3049, 3295)
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
-
-
-@pytest.fixture
-def mono() -> str:
-    """Half the work of RGB; what moves is the same."""
-    return activate(VARIANT)
 
 
 @pytest.mark.slow

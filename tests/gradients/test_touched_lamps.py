@@ -8,7 +8,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import adjoint_identity, fd, forward
-from variants import activate
 
 import psdr_jit
 from psdr_jit.derivative.perturbation import perturb
@@ -78,11 +77,6 @@ CASES = {  # scene, parameter, direction, depth
     "painted": (picture, "camera.to_world", X, 3),
     "in-a-mirror": (lambda: sunk(mirror=mirror()), "lamp.vertex_positions", X, 3),
 }
-
-
-@pytest.fixture
-def mono() -> str:
-    return activate("llvm_ad_mono")
 
 
 @pytest.mark.slow
