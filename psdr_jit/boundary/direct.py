@@ -12,6 +12,7 @@ edge's material velocity, u_S the emitter point's (the interior term keeps emitt
 the boundary integral of [Zhang et al. 2020, §5] with the segment's measure written at x_B. Limits of the same formula:
 infinitely distant emitters have r_B/r_S = 0, and a directional light that turns adds −r_B n_⊥·ω̇; delta emitters
 replace L_e dω by their intensity over distance².
+Mitsuba starts rays a little above surfaces, and x_D is that of the ray which is the line (`lifted_receiver.py`).
 Silhouettes only: an edge whose two faces lie on different sides of the line blocks it on both. Steps that a light
 brings along itself, the frame of a picture or the rim of a cone, take a part of the samples (`light_steps.py`), and so
 do the planes of coarse smooth-shaded faces, whether they are lit or shine (`horizons.py`, `light_horizons.py`). Lights
@@ -34,10 +35,8 @@ from ..core.streams import Stream, stream_seed
 from ..edges.followed_lights import is_followed
 from ..edges.kind import Use
 from ..edges.location import EdgeLocation
-from ..edges.points import LEAST_SLANT, start_height
 from ..options import Options
 from ..paths.smooth_lights import has_smooth_lights
-from ..paths.surface_at import surface_at
 from ..paths.walk import SHADOW_EPSILON
 from ..plan.job import Job
 from ..plan.motion import Displacements
@@ -51,10 +50,10 @@ from ..sampling.light_steps import light_step_weights
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
-from ..scene.surfaces import Surfaces
 from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
+from .lifted_receiver import lifted_receiver
 from .light_horizons import LIGHT_HORIZONS
 from .light_lines import LightLine, sample_light_lines
 from .light_steps import BORNE
@@ -67,9 +66,6 @@ NAME = "direct"
 #: Under a sky, every direction leads to light and most lines to no receiver: they end after a ray or two, and as many
 #: are drawn as make about one path per sample.
 LINES_PER_PATH_UNDER_SKY = 2
-
-#: Share of the height at which rays start that is left out above a surface which one looks for from there.
-INSIDE = 0.02
 
 
 @dataclass
@@ -139,11 +135,11 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.
     down = mi.Ray3f(start, -light.ω, 0, line.wavelengths)
     pd = scene.ray_intersect_preliminary(down, coherent=False, active=active)
-    r = pd.t - on.lead
     # A contour's own surface may begin within its lead.
-    active &= pd.is_valid() & (r > dr.select(on.aside > 0, on.offset, on.lead))
-    if any(kind.surfaces_meet for kind in edges.table.kinds):
-        active &= ~thinner_than_lift(scene, job.surfaces, pd, down, active)
+    active &= pd.is_valid() & ((on.aside == 0) | (pd.t - on.lead > on.offset))
+    receiver, above, found = lifted_receiver(scene, job.surfaces, on.x, pd, down, active)
+    active &= found
+    r = dr.maximum(pd.t - on.lead - above, 0)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     segment = BoundarySegment(
@@ -153,7 +149,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
         n_perp=light.n_perp,
         emitter=dr.reinterpret_array(mi.UInt32, light.emitter),
         source=Hit.of(up, pi),
-        receiver=Hit.of(down, pd),
+        receiver=receiver,
         r=r,
         ratio=dr.select(infinite, 0, r / (r + light.dist)),
         value=-light.value * line.weight * light.across,
@@ -162,22 +158,6 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
         drawn=line.drawn,
     )
     return compact(segment, active)
-
-
-def thinner_than_lift(scene: mi.Scene, surfaces: Surfaces | None, hit, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-    """Is the shadow that ends at `hit` too thin to be in the image, next to where two surfaces meet?
-
-    Mitsuba starts rays a height h above surfaces. The line is met at that height by the ray of another receiver, whose
-    place may lie beyond the curve where the surfaces meet: no receiver has this shadow then.
-    """
-    si = surface_at(surfaces, hit, ray, mi.RayFlags.Minimal, active)
-    facing = dr.dot(si.n, ray.d)
-    n = dr.select(facing > 0, -si.n, si.n)
-    height = start_height(si.p)
-    lowered = dr.minimum(dr.abs(facing) / LEAST_SLANT, 1)  # of a line that grazes the surface we do not go so far back
-    on_line = si.p - ray.d * height / dr.maximum(dr.abs(facing), LEAST_SLANT)
-    down = mi.Ray3f(on_line, -n, (1 - INSIDE) * height * lowered, 0, ray.wavelengths)
-    return scene.ray_test(down, active & si.is_valid() & (facing != 0))
 
 
 def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> BoundarySamples:

@@ -17,7 +17,7 @@ from ..core.low_discrepancy import lane_sampler
 from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.followed_lights import followed_lights
-from ..edges.kind import Line, Sight
+from ..edges.kind import Line, OnEdge, Sight
 from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
 from ..paths.surface_at import surface_at
@@ -26,7 +26,11 @@ from ..plan.job import Job
 from ..sampling.guided import guided
 from ..sampling.relevance import SecondaryEdges
 from ..sampling.rows import edge_samples
+from .lifted_receiver import lifted_receiver
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, recorded_vertices
+
+#: Distance from an edge, in its step aside, at which lines to receivers start.
+NEAR = 3.0
 
 
 @dataclass
@@ -80,12 +84,10 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     through, n_perp = line.through, line.n_perp
     on, ω, pdf_sa = through.on, through.ω, through.pdf_sa
     start = on.x + on.aside * n_perp
-    down = mi.Ray3f(start - on.lead * ω, -ω, 0, line.wavelengths)
-    pi = job.scene.ray_intersect_preliminary(down, coherent=False, active=line.valid)
+    down, pi = first_receiver(job, on, start, -ω, line.wavelengths, line.valid)
     if job.scene.environment() is not None and job.form == "spatial":
         # Lines of which one end escapes have their receiver at the other, whichever direction was drawn.
-        up = mi.Ray3f(start + on.lead * ω, ω, 0, line.wavelengths)
-        other = job.scene.ray_intersect_preliminary(up, coherent=False, active=line.valid)
+        up, other = first_receiver(job, on, start, ω, line.wavelengths, line.valid)
         open_end = ~(pi.is_valid() & other.is_valid())
         turn = ~pi.is_valid()
         ω = dr.select(turn, -ω, ω)
@@ -95,16 +97,35 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     valid = line.valid & pi.is_valid()
     if job.facts.has_delta_lobes:  # smooth lobes receive nothing there
         valid &= ~lies_within(job, on.x, pi, down)
+    receiver, above, found = lifted_receiver(job.scene, job.surfaces, on.x, pi, down, valid)
+    valid &= found
+    r = dr.maximum(pi.t + dr.dot(start - down.o, ω) - above, on.offset)
+    sight = Sight.of(on, line.row, line.t, ω, r, n_perp)
+    sight.lead = dr.minimum(on.lead, r)  # rays beside the edge start no farther off than x_D
     view = EdgeView(
         lane=line.lane,
-        sight=Sight.of(on, line.row, line.t, ω, pi.t + on.lead, n_perp),
-        receiver=Hit.of(down, pi),
+        sight=sight,
+        receiver=receiver,
         value=line.weight * line.across,
         pdf=line.pdf_row * pdf_sa,
         wavelengths=line.wavelengths,
         drawn=line.drawn,
     )
     return compact(view, valid)
+
+
+def first_receiver(
+    job: Job, on: OnEdge, start: mi.Point3f, d: mi.Vector3f, wavelengths, active: mi.Bool
+) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
+    """What a line through an edge meets in the direction `d`, with the ray that meets it.
+
+    From near the edge, so that a surface close by is met; but for lines that meet a face of the edge itself there.
+    """
+    ray = mi.Ray3f(start + dr.minimum(NEAR * on.offset, on.lead) * d, d, 0, wavelengths)
+    pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    own = active & pi.is_valid() & (pi.t < on.lead) & lies_within(job, on.x, pi, ray)
+    ray.o = dr.select(own, start + on.lead * d, ray.o)
+    return ray, dr.select(own, job.scene.ray_intersect_preliminary(ray, coherent=False, active=own), pi)
 
 
 def lies_within(job: Job, x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:

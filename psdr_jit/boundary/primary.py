@@ -28,6 +28,7 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
+from ..core.varying import varying
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
 from ..edges.points import VISIBILITY_EPSILON
@@ -43,6 +44,7 @@ from ..sampling.film_edges import FilmEdges, film_edges, film_weights
 from ..sampling.guided import guided
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
+from .close_by import hidden_close_by
 
 NAME = "primary"
 
@@ -117,6 +119,9 @@ def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     ray = mi.Ray3f(view.o, direction / distance)
     ray.maxt = distance * (1 - VISIBILITY_EPSILON)
     blocked = job.scene.ray_test(_from_its_end(ray), active)
+    body = edges.table.body(seen.sight)
+    scale = distance + varying(mi.Float, job.facts.reach)
+    blocked |= hidden_close_by(job.scene, ray(ray.maxt), body, scale, active & ~blocked)
     if job.options.hide_emitters:
         pi = job.scene.ray_intersect_preliminary(ray, active=active)
         _, pi = see_through_emitters(job.scene, ray, pi)

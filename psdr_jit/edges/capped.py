@@ -1,6 +1,6 @@
 """Ends of cylinders that disks close, as of cans and coins: two rims in one place.
 
-Each would count the step across them. One is kept, that of the cylinder, and what lies on its two sides is traced: wall
+Each would count the step across them. One is kept, that farther out, and what lies on its two sides is traced: wall
 and lid from above, wall and what is behind from below.
 """
 
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..paths.rays import ROUNDING
 from .curves import CURVES_OF, PIECES, Curve, CurveSet
 
 #: How far rims may be apart, and their radii, relative to these; and the sine of the angle between their planes.
@@ -33,7 +34,13 @@ def joined_rims(curves: CurveSet, plugins: Sequence[str], moving: Sequence[bool]
             same = [moving[rims[k][0]] == moving[rims[lid][0]] for k in ends]
             found = np.flatnonzero(_coincide(circle, circles) & same & ~closed[ends])
             if len(found):
-                closed[ends[found[0]]] = closing[lid] = True
+                end = found[0]
+                shape, curve = rims[ends[end]]
+                outward = axes[2][shape] * (1 if curve == Curve.CYLINDER_TOP else -1)
+                wider = circle[2].max() - circles[end][2].max()
+                beyond = wider > ROUNDING * circle[2].max() or outward @ (circle[0] - circles[end][0]) > 0
+                kept, left = (lid, ends[end]) if beyond else (ends[end], lid)
+                closed[kept] = closing[left] = True
     return np.repeat(closed, PIECES), np.repeat(closing, PIECES)
 
 

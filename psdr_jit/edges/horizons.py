@@ -29,9 +29,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.lift import start_height
 from .kind import Side, Sight
 from .location import EdgeLocation
-from .points import MITSUBA_LIFT
 from .shading_curve import Face
 from .smooth_faces import FaceRows, SmoothFaces
 
@@ -123,7 +123,7 @@ class Horizons:
             ω=dr.select(ball, ω_ball, ω_all),
             n=n,
             size=face.size,
-            offset=MITSUBA_LIFT * (1 + dr.max(dr.abs(x))),
+            offset=start_height(x),
             pdf=dr.select(ball, dr.rcp(2 * half), pdf_all) / face.area,
             target=row % self.per_face,
             pi=pi,

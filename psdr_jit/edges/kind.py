@@ -154,7 +154,6 @@ class EdgeKind(ABC):
     """One family of discontinuities."""
 
     blocks_light: ClassVar[bool] = True  # do shadow rays notice it at all?
-    surfaces_meet: ClassVar[bool] = False  # along it, two surfaces cut into each other
     shades_only: ClassVar[bool] = False  # does only what one surface sends step there, not its place or normal?
 
     @property
@@ -197,6 +196,12 @@ class EdgeKind(ABC):
     def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
         """Where a ray is aimed that asks whether the viewer sees the edge: the point, or a little off it."""
         return sight.at.x
+
+    def body(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """A point of the sheet that ends at the edge, next to it: of an edge that lies on another surface, it tells on
+        which side of it. The point that is aimed at where no such question arises.
+        """
+        return self.aim(row, sight, active)
 
     @abstractmethod
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:

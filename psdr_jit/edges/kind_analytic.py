@@ -86,6 +86,13 @@ class AnalyticCurves(ContourKind):
         rim = is_rim(dr.gather(mi.UInt32, self.curves.rows.kind, row, active))
         return sight.at.x + dr.select(rim, 0, VISIBILITY_EPSILON * sight.at.scale) * sight.n_perp
 
+    def body(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """On the sheet that ends at a rim."""
+        rows, columns = self._columns(row, active)
+        rim = is_rim(rows.kind) & ~dr.gather(mi.Bool, self.closed, row, active)
+        local = own_surface(rows.kind, sight.at.local, mi.Vector3f(0), mi.Float(0), mi.Float(INSET))
+        return dr.select(rim, transform_point(columns, local), self.aim(row, sight, active))
+
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
         """The shape itself on the side −n_perp, and whatever a ray meets on the other.
 
@@ -103,9 +110,10 @@ class AnalyticCurves(ContourKind):
         pi.t = dr.select(pi.valid, sight.r, dr.inf)
         pi.shape = dr.gather(mi.ShapePtr, self.curves.pointers, rows.shape, pi.valid)
         pi.prim_uv = mi.Point2f(local.x, local.y)  # of a disk; the others ask for the point alone
-        beside = sight.past_lift().beside(which)
+        beside = sight.beside(which)
+        aside = mi.Vector3f(sight.past_lift().beside(which).o - beside.o)
         ray = mi.Ray3f(dr.select(own, transform_point(columns, local) - sight.r * sight.ω, beside.o), beside.d)
-        return Side(ray, pi, ~own, own, mi.Bool(True))
+        return Side(ray, pi, ~own, own, mi.Bool(True), dr.select(own, 0, aside))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -28,8 +27,6 @@ NEAREST = 0.1
 @dataclass(frozen=True)
 class Junctions(BetweenFaces):
     """Segments between triangles, and arcs between a ball and triangles, as edges between both surfaces."""
-
-    surfaces_meet: ClassVar[bool] = True
 
     rows: EdgeRows
     index: mi.UInt32  # by row: entry of `curves`

@@ -114,7 +114,7 @@ class MeshEdges(BetweenFaces):
         beside = sight.beside(which)
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
         farther = mi.Vector3f(sight.past_lift().beside(which).o - beside.o)
-        aside = dr.select(silhouette & ~rows.traced & ~face, farther, 0)
+        aside = dr.select((silhouette | rows.border) & ~rows.traced & ~face, farther, 0)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
         differs = in_view & (rows.border | silhouette | rows.seam) | rows.traced
@@ -135,6 +135,12 @@ class MeshEdges(BetweenFaces):
         past = ~border & (a0 * a1 > 0) & (dr.minimum(dr.abs(a0), dr.abs(a1)) < NEARLY_EDGE_ON)
         towards = dr.select(onto, 1.0, dr.select(one | past, -1.0, 0.0))
         return sight.at.x + towards * dr.sign(a0 + a1) * sight.offset * sight.n_perp
+
+    def body(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
+        """On the face of a border."""
+        rows = dr.gather(EdgeRows, self.rows, row, active)
+        into = dr.normalize(dr.cross(rows.n0, rows.p1 - rows.p0))
+        return dr.select(rows.border & ~rows.traced, sight.at.x + sight.lead * into, self.aim(row, sight, active))
 
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """A point of face 0 or 1 next to the edge, as if the viewer had looked at it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..core.lift import start_height
 from ..paths.rays import ROUNDING
 
 #: Sideways distance at which a ray that passes an edge is traced, relative to the distance from the scene's centre: far
@@ -25,10 +26,8 @@ INSET = 3e-4
 #: Largest such share, in sharp corners: see `face_inset`.
 LARGEST_INSET = 0.3
 
-#: Height at which Mitsuba starts rays above a surface, relative to 1 + the largest coordinate (`math::RayEpsilon`).
-MITSUBA_LIFT = 8.9e-5
-
-#: We stay clear of that by this factor; of surfaces that meet almost flush, as if by this sine of their angle.
+#: We stay clear of the height at which Mitsuba starts rays by this factor; of surfaces that meet almost flush, as if
+#: by this sine of their angle.
 CLEAR_OF_LIFT, LEAST_SLANT = 2.0, 0.05
 
 #: Largest step aside that is taken to stay clear of it: this share of the viewer's distance.
@@ -59,13 +58,8 @@ def clearance(x: mi.Point3f, size: mi.Float, centre: mi.Point3f, blur: mi.Float 
     return visible + rounding, LEAD * visible + ROUNDING_LEAD * rounding
 
 
-def start_height(x: mi.Point3f) -> mi.Float:
-    """The height above a surface at `x` at which Mitsuba starts rays [m]."""
-    return MITSUBA_LIFT * (1 + dr.max(dr.abs(x)))
-
-
 def clear_of_lift(x: mi.Point3f) -> mi.Float:
-    """A height above a surface at `x` that is more than that [m]."""
+    """A height above a surface at `x` that is clear of the one at which Mitsuba starts rays [m]."""
     return CLEAR_OF_LIFT * start_height(x)
 
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
+from ..core.lift import INSIDE, seen_side, start_height
 from .contact_limits import Touching
 from .kind import EdgeKind, OnEdge, Side, Sight
 from .location import EdgeLocation
@@ -71,6 +72,10 @@ class EdgeTable:
         """Where rays are aimed that ask whether the viewer sees the edges."""
         return self.ask(sight.at.row, lambda kind, row, own: kind.aim(row, sight, own))
 
+    def body(self, sight: Sight) -> mi.Point3f:
+        """Points of the sheets that end at the edges."""
+        return self.ask(sight.at.row, lambda kind, row, own: kind.body(row, sight, own))
+
     def displacement(self, at: EdgeLocation, ω: mi.Vector3f) -> mi.Vector3f:
         """Vector of value 0 whose derivative is the velocity of the edges there, seen along ω, attached."""
         return self.ask(at.row, lambda kind, row, own: kind.displacement(row, at, ω, own))
@@ -111,8 +116,9 @@ def look_behind(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt3
 def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengths):
     """What lies on a side: `(ray, pi)`, traced where `wanted`.
 
-    Another shape next to an outline is looked at once more, from farther aside: rays that start there must be clear
-    of the shape. Nothing else is, for that far aside the next fold of the shape may have ended as well.
+    Another shape next to an outline is looked at once more, from farther aside, where rays cannot start there as they
+    start elsewhere: at their height they are behind what they should pass. Nothing else is, for that far aside the
+    next fold of the shape, or the gap below it, may have ended as well.
     """
     ray, asked = side.ray, side.traced & wanted
     ray.wavelengths = wavelengths
@@ -120,6 +126,20 @@ def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengt
     beyond = dr.dot(ray.o + found.t * ray.d - sight.at.x, ray.d)
     again = asked & found.is_valid() & (beyond < NEXT_TO_OUTLINE * clear_of_lift(sight.at.x)) & dr.any(side.aside != 0)
     again &= dr.reinterpret_array(mi.UInt32, found.shape) != side.shape
+    again &= rays_start_behind(scene, sight.at.x, ray, found, again)
     ray.o = dr.select(again, ray.o + side.aside, ray.o)
     found = dr.select(again, scene.ray_intersect_preliminary(ray, coherent=False, active=again), found)
     return ray, dr.select(side.traced, found, side.pi)
+
+
+def rays_start_behind(
+    scene: mi.Scene, x: mi.Point3f, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, asked: mi.Bool
+) -> mi.Bool:
+    """Is an edge at x lower above the surface that `ray` meets behind it than rays start there, or do these start
+    behind something?
+    """
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, asked)
+    n = seen_side(si, ray.d)
+    height = start_height(si.p)
+    up = mi.Ray3f(si.p + INSIDE * height * n, n, (1 - INSIDE) * height, 0, ray.wavelengths)
+    return (dr.dot(n, x - si.p) < height) | scene.ray_test(up, asked)

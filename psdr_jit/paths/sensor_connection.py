@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
+from ..core.lift import start_height
 from ..core.sensor_frame import SensorFrame, View
-from .rays import SHADOW_EPSILON, see_through_emitters
+from .rays import ROUNDING, SHADOW_EPSILON, see_through_emitters
+
+#: Share of the height at which rays start within which what is in front of a surface does not hide it, and the least
+#: cosine by which that becomes a length along a ray.
+TOUCHES, LEAST_COSINE = 0.1, 0.05
 
 
 def on_film(frame: SensorFrame, view: View, margin: mi.Float | float = 0.0) -> mi.Bool:
@@ -19,12 +25,21 @@ def on_film(frame: SensorFrame, view: View, margin: mi.Float | float = 0.0) -> m
 def seen_by_sensor(
     scene: mi.Scene, si: mi.SurfaceInteraction3f, view: View, hide_emitters: bool, active: mi.Bool
 ) -> mi.Bool:
-    """Is nothing between `si` and the start of its viewing ray? Hidden emitters are transparent, and not seen."""
-    if not hide_emitters:
-        return active & ~scene.ray_test(si.spawn_ray_to(view.o), active)
-    active = active & (si.shape.emitter() == None)  # noqa: E711 (an array comparison)
+    """Is nothing between the start of its viewing ray and `si`? Hidden emitters are transparent, and not seen.
+
+    As camera rays see it, from which no height above the surface is left out: next to an outline, or below something
+    thin, another point is hidden from that height.
+    """
+    cos = dr.maximum(dr.abs(dr.dot(si.n, view.ω)), LEAST_COSINE)
+    height = start_height(si.p)
     ray = mi.Ray3f(view.o, view.ω)
-    ray.maxt = view.r * (1 - SHADOW_EPSILON)
-    pi = scene.ray_intersect_preliminary(ray, active=active)
-    _, pi = see_through_emitters(scene, ray, pi)
-    return active & ~pi.is_valid()
+    ray.maxt = view.r - (TOUCHES * height + ROUNDING * view.r) / cos
+    if hide_emitters:
+        active = active & (si.shape.emitter() == None)  # noqa: E711 (an array comparison)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    if hide_emitters:
+        _, pi = see_through_emitters(scene, ray, pi)
+    # What is met may be the surface itself: where a large face is, is rounded.
+    itself = (pi.shape == si.shape) & (pi.prim_index == si.prim_index)
+    itself &= pi.t >= view.r * (1 - SHADOW_EPSILON) - height / cos
+    return active & (~pi.is_valid() | itself)

@@ -16,7 +16,7 @@ from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
 from .capabilities import CONE_PARAMETERS, COPIES, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
 from .facts import SceneFacts, ShapeFacts
-from .size import loss_by_offsets, overflow
+from .size import overflow, too_low_for_shadows
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def check_extent(facts: SceneFacts) -> Iterator[Finding]:
     """Single precision: what is too large overflows, what is small or far away loses a part to ray offsets."""
     if text := overflow(facts):
         yield Finding(SceneError, "", text)
-    elif facts.geometry_moves and (text := loss_by_offsets(facts)):
+    elif facts.geometry_moves and (text := too_low_for_shadows(facts)):
         yield Finding(UnsupportedWarning, "", text)
 
 

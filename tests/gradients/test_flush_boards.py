@@ -9,7 +9,7 @@ from helpers import forward
 
 from psdr_jit.derivative.perturbation import perturb
 
-SPP, SEEDS = 256, 8
+SPP, SEEDS = 256, 24
 
 
 def joint(overlap: float) -> mi.Scene:

@@ -1,0 +1,103 @@
+"""Things a hair above a floor, below a table or behind a face: nearer than the height at which rays start, about as
+near, and farther off. Against differences, by blocks of pixels.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import fd, forward
+
+from psdr_jit.derivative.perturbation import perturb
+
+SPP, SEEDS, RES, BLOCK = 256, 8, 20, 4
+SPEC = {"type": "psdr_path", "max_depth": 3}
+UP = [0, 1, 0]
+GAPS = (1e-5, 3e-4, 3e-3)
+
+
+def T():
+    return mi.ScalarTransform4f()
+
+
+def sheet(reflectance: float, two_sided: bool = True) -> dict:
+    bsdf = {"type": "diffuse", "reflectance": reflectance}
+    return {"type": "twosided", "bsdf": bsdf} if two_sided else bsdf
+
+
+def flat(kind: str, height: float, scale: list[float], z: float, reflectance: float) -> dict:
+    pose = T().translate([0, height, z]).rotate([1, 0, 0], -90).scale(scale)
+    return {"type": kind, "to_world": pose, "bsdf": sheet(reflectance)}
+
+
+def body(what: str, gap: float) -> dict:
+    """It is called `body`, whatever holds it."""
+    if what == "rug":
+        return {"body": flat("rectangle", gap, [0.8, 0.5, 1], 0.5, 0.2)}
+    if what == "coin":
+        return {"body": flat("disk", gap, [0.6, 0.6, 1], 0.5, 0.2)}
+    if what == "card":
+        half = 0.5 - gap / 2
+        pose = T().translate([0, 0.5 + gap / 2, 0]).rotate(UP, 25).scale([0.5, half, 1])
+        return {"body": {"type": "rectangle", "to_world": pose, "bsdf": sheet(0.5)}}
+    if what == "box":
+        pose = T().translate([0, 0.5 + gap / 2, 0]).scale([0.4, 0.5 - gap / 2, 0.3])
+        return {"body": {"type": "cube", "to_world": pose, "bsdf": sheet(0.5, two_sided=False)}}
+    if what == "tube":
+        return {"body": {"type": "cylinder", "p0": [0, gap, 0], "p1": [0, 0.5, 0], "radius": 0.5, "bsdf": sheet(0.5)}}
+    # a table top on a tube
+    leg = {"type": "cylinder", "p0": [0, -0.3, 0], "p1": [0, 0.5, 0], "radius": 0.6, "bsdf": sheet(0.5)}
+    return {"leg": leg, "body": flat("disk", 0.5, [0.6 + gap, 0.6 + gap, 1], 0, 0.5)}
+
+
+def room(**objects) -> mi.Scene:
+    film = {"type": "hdrfilm", "width": RES, "height": RES, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    ground = T().rotate([1, 0, 0], -90).scale(4)
+    lamp = T().translate([1, 3, 1]).rotate([1, 0, 0], 90).scale(0.5)
+    return mi.load_dict({
+        "type": "scene", "floor": {"type": "rectangle", "to_world": ground, "bsdf": sheet(0.6, two_sided=False)},
+        "lamp": {"type": "rectangle", "to_world": lamp, "light": {"type": "area", "radiance": 10.0}},
+        "sensor": {"type": "perspective", "fov": 40, "film": film,
+                   "to_world": T().look_at([0, 1.2, 4], [0, 0.5, 0], UP)}, **objects,
+    }, optimize=False)  # fmt: skip
+
+
+def assert_by_blocks(motion, step: float, spp: int) -> None:
+    """Rms of blocks, relative to that of the differences: noise, and 2.5 % of steps that are too large."""
+    ours, differences = forward(motion, SPEC, SEEDS, SPP), fd(motion, SPEC, step, SEEDS, spp)
+    (a, ea), (b, eb) = ((x.mean(0), x.std(0) / np.sqrt(SEEDS)) for x in map(_blocks, (ours, differences)))
+    noise = np.sqrt(np.sum(ea**2 + eb**2) / np.sum(b**2))
+    assert noise < 0.025
+    assert np.sqrt(np.sum((a - b) ** 2) / np.sum(b**2)) < 0.025 + noise
+
+
+def _blocks(images: np.ndarray) -> np.ndarray:
+    return images[..., 0].reshape(len(images), RES // BLOCK, BLOCK, RES // BLOCK, BLOCK).mean((2, 4))
+
+
+@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("what", ["rug", "coin", "card", "box", "tube"])
+@pytest.mark.parametrize("moved", ["sensor.to_world", "body"])
+def test_above_a_floor(mono, what, gap, moved):
+    """60 to 10 % off where rays were taken to start on surfaces."""
+    name = {"body": "body.vertex_positions" if what == "box" else "body.to_world"}.get(moved, moved)
+    scene = room(**body(what, gap))
+    if name not in mi.traverse(scene):
+        name = "body.vertex_positions"
+    assert_by_blocks(perturb(scene, name, (1, 0, 0.3)), 0.02, 1024)
+
+
+@pytest.mark.parametrize("overhang", [3e-4, 3e-3, 3e-2])
+def test_a_table_top(mono, overhang):
+    """The rim of the leg touches it from below: 18 to 5 % too much where that was seen through the top."""
+    assert_by_blocks(perturb(room(**body("table", overhang)), "sensor.to_world", (1, 0, 0.3)), 0.006, 2048)
+
+
+@pytest.mark.parametrize("inset", [1e-4, 1e-3])
+def test_a_board_behind_the_face_of_a_post(mono, inset):
+    """Its end is inside of the post, and a hair behind the face is behind it: 35 %."""
+    post = {"type": "cube", "to_world": T().translate([-0.4, 0.5, 0]).scale([0.2, 0.5, 0.2]), "bsdf": sheet(0.5, False)}
+    board = T().translate([0.3, 0.6, 0.1 - inset]).scale([0.6, 0.1, 0.1])
+    scene = room(post=post, body={"type": "cube", "to_world": board, "bsdf": sheet(0.8, False)})
+    assert_by_blocks(perturb(scene, "sensor.to_world", (1, 0, 0)), 0.01, 1024)
