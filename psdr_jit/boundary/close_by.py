@@ -9,9 +9,7 @@ from ..core.lift import seen_side
 from ..paths.rays import ROUNDING
 
 
-def hidden_close_by(
-    scene: mi.Scene, o: mi.Point3f, body: mi.Point3f, scale: mi.Float, active: mi.Bool
-) -> mi.Bool:
+def hidden_close_by(scene: mi.Scene, o: mi.Point3f, body: mi.Point3f, scale: mi.Float, active: mi.Bool) -> mi.Bool:
     """Does the way from `o`, close to an edge, to its `body` meet a surface that has this behind it by more than
     rounding?
 

@@ -118,14 +118,14 @@ def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     distance = dr.norm(direction)
     ray = mi.Ray3f(view.o, direction / distance)
     ray.maxt = distance * (1 - VISIBILITY_EPSILON)
-    blocked = job.scene.ray_test(_from_its_end(ray), active)
-    body = edges.table.body(seen.sight)
-    scale = distance + varying(mi.Float, job.facts.reach)
-    blocked |= hidden_close_by(job.scene, ray(ray.maxt), body, scale, active & ~blocked)
     if job.options.hide_emitters:
         pi = job.scene.ray_intersect_preliminary(ray, active=active)
         _, pi = see_through_emitters(job.scene, ray, pi)
         blocked = pi.is_valid()
+    else:
+        blocked = job.scene.ray_test(_from_its_end(ray), active)
+        body, scale = edges.table.body(seen.sight), distance + varying(mi.Float, job.facts.reach)
+        blocked |= hidden_close_by(job.scene, ray(ray.maxt), body, scale, active & ~blocked)
     return compact(sample, active & ~blocked)
 
 

@@ -34,12 +34,10 @@ def joined_rims(curves: CurveSet, plugins: Sequence[str], moving: Sequence[bool]
             same = [moving[rims[k][0]] == moving[rims[lid][0]] for k in ends]
             found = np.flatnonzero(_coincide(circle, circles) & same & ~closed[ends])
             if len(found):
-                end = found[0]
-                shape, curve = rims[ends[end]]
+                end = ends[found[0]]
+                shape, curve = rims[end]
                 outward = axes[2][shape] * (1 if curve == Curve.CYLINDER_TOP else -1)
-                wider = circle[2].max() - circles[end][2].max()
-                beyond = wider > ROUNDING * circle[2].max() or outward @ (circle[0] - circles[end][0]) > 0
-                kept, left = (lid, ends[end]) if beyond else (ends[end], lid)
+                kept, left = (lid, end) if _beyond(circle, circles[found[0]], outward) else (end, lid)
                 closed[kept] = closing[left] = True
     return np.repeat(closed, PIECES), np.repeat(closing, PIECES)
 
@@ -50,6 +48,12 @@ def _circle(axes: list[np.ndarray], curve: Curve) -> tuple[np.ndarray, np.ndarra
     normal = np.cross(x, y)
     radii = np.array([np.linalg.norm(x), np.linalg.norm(y)])
     return origin + _ENDS[curve] * z, normal / max(np.linalg.norm(normal), np.finfo(float).tiny), radii
+
+
+def _beyond(lid: tuple, end: tuple, outward: np.ndarray) -> bool:
+    """Is a lid a hair wider than the end that it closes, or does it lie a hair outside of it?"""
+    wider = lid[2].max() - end[2].max() > ROUNDING * lid[2].max()
+    return wider or outward @ (lid[0] - end[0]) > 0
 
 
 def _coincide(one: tuple, others: Sequence[tuple]) -> np.ndarray:

@@ -82,10 +82,12 @@ class Sight:
     def viewer(self) -> mi.Point3f:
         return self.at.x - self.r * self.ω
 
-    def past_lift(self) -> Sight:
-        """From where rays that Mitsuba starts beside the edge are clear of the shape: see `points.past_lift`."""
+    def past_lift(self, which: mi.UInt32) -> mi.Vector3f:
+        """From where the ray `beside` starts to where rays that Mitsuba starts beside the edge are clear of the shape:
+        see `points.past_lift`.
+        """
         offset, lead = past_lift(self.at.x, self.offset, self.lead, self.r)
-        return replace(self, offset=offset, lead=lead)
+        return mi.Vector3f(replace(self, offset=offset, lead=lead).beside(which).o - self.beside(which).o)
 
     def beside(self, which: mi.UInt32) -> mi.Ray3f:
         """The ray that passes the edge on side `which`: 0 towards −n_perp, 1 towards +n_perp."""

@@ -111,9 +111,8 @@ class AnalyticCurves(ContourKind):
         pi.shape = dr.gather(mi.ShapePtr, self.curves.pointers, rows.shape, pi.valid)
         pi.prim_uv = mi.Point2f(local.x, local.y)  # of a disk; the others ask for the point alone
         beside = sight.beside(which)
-        aside = mi.Vector3f(sight.past_lift().beside(which).o - beside.o)
         ray = mi.Ray3f(dr.select(own, transform_point(columns, local) - sight.r * sight.ω, beside.o), beside.d)
-        return Side(ray, pi, ~own, own, mi.Bool(True), dr.select(own, 0, aside))
+        return Side(ray, pi, ~own, own, mi.Bool(True), dr.select(own, 0, sight.past_lift(which)))
 
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """That of the material point: a contour moves with n·v of the surface."""

@@ -113,8 +113,7 @@ class MeshEdges(BetweenFaces):
         pi = self._face(rows, use1, sight, face & active)
         beside = sight.beside(which)
         ray = mi.Ray3f(dr.select(face, sight.viewer, beside.o), beside.d)
-        farther = mi.Vector3f(sight.past_lift().beside(which).o - beside.o)
-        aside = dr.select((silhouette | rows.border) & ~rows.traced & ~face, farther, 0)
+        aside = dr.select((silhouette | rows.border) & ~rows.traced & ~face, sight.past_lift(which), 0)
         # Borders of two shapes at one place, of which one moves: their faces move against each other.
         own = face & ((rows.shape0 == rows.shape1) | ~rows.moves)
         differs = in_view & (rows.border | silhouette | rows.seam) | rows.traced

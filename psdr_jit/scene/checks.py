@@ -198,7 +198,7 @@ def check_delta_weights(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def check_extent(facts: SceneFacts) -> Iterator[Finding]:
-    """Single precision: what is too large overflows, what is small or far away loses a part to ray offsets."""
+    """Single precision: what is too large overflows, images of what is small or far away lack a part."""
     if text := overflow(facts):
         yield Finding(SceneError, "", text)
     elif facts.geometry_moves and (text := too_low_for_shadows(facts)):
