@@ -53,7 +53,7 @@ from ..scene.facts import SceneFacts
 from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
-from .lifted_receiver import lifted_receiver
+from .lifted_receiver import Landing, lifted_receiver
 from .light_horizons import LIGHT_HORIZONS
 from .light_lines import LightLine, sample_light_lines
 from .light_steps import BORNE
@@ -134,12 +134,12 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
 
     # Towards the receiver: from just above the edge, so that an edge resting on a surface ends there.
     down = mi.Ray3f(start, -light.ω, 0, line.wavelengths)
-    pd = scene.ray_intersect_preliminary(down, coherent=False, active=active)
+    met = Landing.of(job, down, active)
     # A contour's own surface may begin within its lead.
-    active &= pd.is_valid() & ((on.aside == 0) | (pd.t - on.lead > on.offset))
-    receiver, above, found = lifted_receiver(scene, job.surfaces, on.x, pd, down, active)
+    active &= met.pi.is_valid() & ((on.aside == 0) | (met.pi.t - on.lead > on.offset))
+    receiver, above, found = lifted_receiver(job, met, on.x, active)
     active &= found
-    r = dr.maximum(pd.t - on.lead - above, 0)
+    r = dr.maximum(met.pi.t - on.lead - above, 0)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)
     segment = BoundarySegment(

@@ -20,13 +20,12 @@ from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, OnEdge, Sight
 from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
-from ..paths.surface_at import surface_at
 from ..paths.walk import walk
 from ..plan.job import Job
 from ..sampling.guided import guided
 from ..sampling.relevance import SecondaryEdges
 from ..sampling.rows import edge_samples
-from .lifted_receiver import lifted_receiver
+from .lifted_receiver import Landing, lifted_receiver
 from .sensor_subpath import UNLIMITED_VERTICES, SubpathRecords, recorded_vertices
 
 #: Distance from an edge, in its step aside, at which lines to receivers start.
@@ -84,22 +83,22 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     through, n_perp = line.through, line.n_perp
     on, ω, pdf_sa = through.on, through.ω, through.pdf_sa
     start = on.x + on.aside * n_perp
-    down, pi = first_receiver(job, on, start, -ω, line.wavelengths, line.valid)
+    met = first_receiver(job, on, start, -ω, line.wavelengths, line.valid)
     if job.scene.environment() is not None and job.form == "spatial":
         # Lines of which one end escapes have their receiver at the other, whichever direction was drawn.
-        up, other = first_receiver(job, on, start, ω, line.wavelengths, line.valid)
-        open_end = ~(pi.is_valid() & other.is_valid())
-        turn = ~pi.is_valid()
+        other = first_receiver(job, on, start, ω, line.wavelengths, line.valid)
+        open_end = ~(met.pi.is_valid() & other.pi.is_valid())
+        turn = ~met.pi.is_valid()
         ω = dr.select(turn, -ω, ω)
         n_perp = dr.select(turn & (on.aside == 0), -n_perp, n_perp)  # a contour's leads off its surface either way
-        down, pi = dr.select(turn, up, down), dr.select(turn, other, pi)
+        met = dr.select(turn, other, met)
         pdf_sa = dr.select(open_end, pdf_sa + through.pdf_reversed, pdf_sa)
-    valid = line.valid & pi.is_valid()
+    valid = line.valid & met.pi.is_valid()
     if job.facts.has_delta_lobes:  # smooth lobes receive nothing there
-        valid &= ~lies_within(job, on.x, pi, down)
-    receiver, above, found = lifted_receiver(job.scene, job.surfaces, on.x, pi, down, valid)
+        valid &= ~lies_within(on.x, met)
+    receiver, above, found = lifted_receiver(job, met, on.x, valid)
     valid &= found
-    r = dr.maximum(pi.t + dr.dot(start - down.o, ω) - above, on.offset)
+    r = dr.maximum(met.pi.t + dr.dot(start - met.ray.o, ω) - above, on.offset)
     sight = Sight.of(on, line.row, line.t, ω, r, n_perp)
     sight.lead = dr.minimum(on.lead, r)  # rays beside the edge start no farther off than x_D
     view = EdgeView(
@@ -114,28 +113,25 @@ def trace_receivers(job: Job, line: EdgeLine) -> EdgeView | None:
     return compact(view, valid)
 
 
-def first_receiver(
-    job: Job, on: OnEdge, start: mi.Point3f, d: mi.Vector3f, wavelengths, active: mi.Bool
-) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-    """What a line through an edge meets in the direction `d`, with the ray that meets it.
+def first_receiver(job: Job, on: OnEdge, start: mi.Point3f, d: mi.Vector3f, wavelengths, active: mi.Bool) -> Landing:
+    """What a line through an edge meets in the direction `d`.
 
     From near the edge, so that a surface close by is met; but for lines that meet a face of the edge itself there.
     """
     ray = mi.Ray3f(start + dr.minimum(NEAR * on.offset, on.lead) * d, d, 0, wavelengths)
-    pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    own = active & pi.is_valid() & (pi.t < on.lead) & lies_within(job, on.x, pi, ray)
-    ray.o = dr.select(own, start + on.lead * d, ray.o)
-    return ray, dr.select(own, job.scene.ray_intersect_preliminary(ray, coherent=False, active=own), pi)
+    met = Landing.of(job, ray, active)
+    own = active & met.pi.is_valid() & (met.pi.t < on.lead) & lies_within(on.x, met)
+    farther = mi.Ray3f(start + on.lead * d, d, 0, wavelengths)
+    return dr.select(own, Landing.of(job, farther, own), met)
 
 
-def lies_within(job: Job, x: mi.Point3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Bool:
-    """Does `ray` from an edge point x lie within the plane of what it meets, as far as rounding tells?
+def lies_within(x: mi.Point3f, met: Landing) -> mi.Bool:
+    """Does a line past an edge point x lie within the plane of what it meets, as far as rounding tells?
 
     It then meets a face of the edge itself, or one in line with it, where it should pass along. A mirror there would
     receive it with a weight of 1/(n·ω).
     """
-    si = surface_at(job.surfaces, hit, ray, mi.RayFlags.Minimal, hit.is_valid())
-    return dr.abs(dr.dot(si.n, x - si.p)) <= ROUNDING * dr.max(dr.abs(x))
+    return dr.abs(dr.dot(met.n, x - met.p)) <= ROUNDING * dr.max(dr.abs(x))
 
 
 def slots(records: SubpathRecords, kept: mi.UInt32) -> mi.UInt32:
@@ -145,9 +141,7 @@ def slots(records: SubpathRecords, kept: mi.UInt32) -> mi.UInt32:
     return slot
 
 
-def radiance_by_depth(
-    job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: int, active: mi.Bool, emission: mi.Bool
-):
+def radiance_by_depth(job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: int, active: mi.Bool, emission: mi.Bool):
     """Radiance along `ray`, by depth: `(by_depth, of the whole path)`.
 
     `lane`: picks the random numbers. `emission`: lanes that count what the first vertex emits.

@@ -12,6 +12,8 @@ x_D at that scale, the difference decides whether the sensor sees the step. An e
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,35 +21,44 @@ from ..core.lift import INSIDE, seen_side, start_height
 from ..core.records import Hit
 from ..edges.points import LEAST_SLANT
 from ..paths.surface_at import surface_at
-from ..scene.surfaces import Surfaces
+from ..plan.job import Job
 
 #: In heights, how far down from there one looks for it: large faces are rounded by about as much.
 FAR_ENOUGH = 2.0
 
 
-def lifted_receiver(
-    scene: mi.Scene,
-    surfaces: Surfaces | None,
-    x: mi.Point3f,
-    pi: mi.PreliminaryIntersection3f,
-    ray: mi.Ray3f,
-    active: mi.Bool,
-) -> tuple[Hit, mi.Float, mi.Bool]:
-    """`(receiver, above, found)` of a line `ray` past an edge point x that meets `pi`: x_D as the end of a ray in the
-    same direction, how long before its end the line is at the height [m], and where there is such a point. Detached.
+@dataclass
+class Landing:
+    """Where a line past an edge meets a surface; detached, one entry per line."""
+
+    ray: mi.Ray3f
+    pi: mi.PreliminaryIntersection3f
+    p: mi.Point3f  # the point of the surface
+    n: mi.Vector3f  # unit normal on the side that is met
+
+    @staticmethod
+    def of(job: Job, ray: mi.Ray3f, active: mi.Bool) -> Landing:
+        """What `ray` meets."""
+        pi = job.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        si = surface_at(job.surfaces, pi, ray, mi.RayFlags.Minimal, active)
+        return Landing(ray, pi, si.p, seen_side(si, ray.d))
+
+
+def lifted_receiver(job: Job, landing: Landing, x: mi.Point3f, active: mi.Bool) -> tuple[Hit, mi.Float, mi.Bool]:
+    """`(receiver, above, found)` of a line past an edge point x: x_D as the end of a ray in the same direction, how
+    long before its end the line is at the height [m], and where there is such a point. Detached.
 
     None is found beyond a curve where two surfaces meet: the shadow that ends there is too thin to be in the image.
     """
-    si = surface_at(surfaces, pi, ray, mi.RayFlags.Minimal, active)
-    n = seen_side(si, ray.d)
+    ray, pi, n = landing.ray, landing.pi, landing.n
     cos = -dr.dot(n, ray.d)
-    height = start_height(si.p)
+    height = start_height(landing.p)
     # Along a line that grazes the surface we do not go so far back.
     lowered = height * dr.minimum(cos / LEAST_SLANT, 1)
     above = height / dr.maximum(cos, LEAST_SLANT)
-    down = mi.Ray3f(si.p - ray.d * above, -n, FAR_ENOUGH * lowered, 0, ray.wavelengths)
-    below = scene.ray_intersect_preliminary(down, coherent=False, active=active & (cos > 0))
-    found = below.is_valid() & (dr.dot(n, x - si.p) > lowered)
+    down = mi.Ray3f(landing.p - ray.d * above, -n, FAR_ENOUGH * lowered, 0, ray.wavelengths)
+    below = job.scene.ray_intersect_preliminary(down, coherent=False, active=active & pi.is_valid() & (cos > 0))
+    found = below.is_valid() & (dr.dot(n, x - landing.p) > lowered)
     # What a large face is met at is rounded: it is the face itself, wherever that is.
     itself = (below.shape == pi.shape) & (below.prim_index == pi.prim_index)
     found &= itself | (dr.abs(below.t - lowered) <= INSIDE * lowered)

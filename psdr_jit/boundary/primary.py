@@ -28,10 +28,8 @@ from ..core.line_guide import Drawn
 from ..core.low_discrepancy import lane_sampler
 from ..core.sensor_frame import View, look_at, viewpoint
 from ..core.streams import Stream, stream_seed
-from ..core.varying import varying
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
-from ..edges.points import VISIBILITY_EPSILON
 from ..edges.table import look_beside
 from ..options import Options
 from ..paths.walk import NoSink, see_through_emitters, walk
@@ -44,7 +42,7 @@ from ..sampling.film_edges import FilmEdges, film_edges, film_weights
 from ..sampling.guided import guided
 from ..sampling.rows import edge_samples
 from ..scene.facts import SceneFacts
-from .close_by import hidden_close_by
+from .edge_visibility import hidden
 
 NAME = "primary"
 
@@ -111,31 +109,10 @@ def sample_visible(job: Job, edges: FilmEdges) -> EdgeSample | None:
     sample = EdgeSample(row, t, aperture, pdf * drawn.p, lane, drawn)
 
     seen = seen_edge(job, edges, sample)
-    view, p = seen.view, seen.view.p
+    p = seen.view.p
     inside = (p.x >= lower[0]) & (p.x < upper[0]) & (p.y >= lower[1]) & (p.y < upper[1])
     active = seen.valid & inside
-    direction = edges.table.aim(seen.sight) - view.o
-    distance = dr.norm(direction)
-    ray = mi.Ray3f(view.o, direction / distance)
-    ray.maxt = distance * (1 - VISIBILITY_EPSILON)
-    if job.options.hide_emitters:
-        pi = job.scene.ray_intersect_preliminary(ray, active=active)
-        _, pi = see_through_emitters(job.scene, ray, pi)
-        blocked = pi.is_valid()
-    else:
-        blocked = job.scene.ray_test(_from_its_end(ray), active)
-        body, scale = edges.table.body(seen.sight), distance + varying(mi.Float, job.facts.reach)
-        blocked |= hidden_close_by(job.scene, ray(ray.maxt), body, scale, active & ~blocked)
-    return compact(sample, active & ~blocked)
-
-
-def _from_its_end(ray: mi.Ray3f) -> mi.Ray3f:
-    """The same segment the other way. A ray that touches a sphere is met at a distance from it that grows with the
-    square of how far away it starts: `ray_test` of Mitsuba 3.9 calculates in single precision.
-    """
-    back = mi.Ray3f(ray(ray.maxt), -ray.d)
-    back.maxt = ray.maxt
-    return back
+    return compact(sample, active & ~hidden(job, edges.table, seen.sight, active))
 
 
 def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
@@ -146,7 +123,7 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     seen = seen_edge(job, edges, s)
     rng = lane_sampler(stream_seed(job.seed, Stream.PRIMARY_RADIANCE), s.lane)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), rng.next_1d())
-    ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths)
+    ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, wavelengths, coherent=True)
     pi.t = dr.select((job.frame.to_local @ ray(pi.t)).z < job.frame.far, pi.t, dr.inf)
     emission = mi.Bool(True)
     if job.options.hide_emitters:

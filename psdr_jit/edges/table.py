@@ -89,13 +89,16 @@ class EdgeTable:
         return self.ask(sight.at.row, lambda kind, row, own: kind.side(row, sight, which, own))
 
 
-def look_beside(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt32, wavelengths):
+def look_beside(
+    scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt32, wavelengths, coherent: bool = False
+):
     """What lies on side `which` of edges: `(ray, pi, differs)`; own faces are known, the rest is traced.
 
-    `differs` is False where both sides are certainly alike.
+    `differs` is False where both sides are certainly alike. `coherent`: rays of neighbouring lanes are nearly alike,
+    and traced together.
     """
     side = table.side(sight, which)
-    ray, pi = traced(scene, side, sight, side.differs, wavelengths)
+    ray, pi = traced(scene, side, sight, side.differs, wavelengths, coherent)
     return ray, pi, side.differs
 
 
@@ -113,7 +116,7 @@ def look_behind(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt3
     return ray, pi, dr.select(side.traced, dr.maximum(beyond, 0), 0)
 
 
-def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengths):
+def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengths, coherent: bool = False):
     """What lies on a side: `(ray, pi)`, traced where `wanted`.
 
     Another shape next to an outline is looked at once more, from farther aside, where rays cannot start there as they
@@ -122,13 +125,13 @@ def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengt
     """
     ray, asked = side.ray, side.traced & wanted
     ray.wavelengths = wavelengths
-    found = scene.ray_intersect_preliminary(ray, coherent=False, active=asked)
+    found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=asked)
     beyond = dr.dot(ray.o + found.t * ray.d - sight.at.x, ray.d)
     again = asked & found.is_valid() & (beyond < NEXT_TO_OUTLINE * clear_of_lift(sight.at.x)) & dr.any(side.aside != 0)
     again &= dr.reinterpret_array(mi.UInt32, found.shape) != side.shape
     again &= rays_start_behind(scene, sight.at.x, ray, found, again)
     ray.o = dr.select(again, ray.o + side.aside, ray.o)
-    found = dr.select(again, scene.ray_intersect_preliminary(ray, coherent=False, active=again), found)
+    found = dr.select(again, scene.ray_intersect_preliminary(ray, coherent=coherent, active=again), found)
     return ray, dr.select(side.traced, found, side.pi)
 
 

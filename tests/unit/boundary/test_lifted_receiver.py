@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit.boundary.lifted_receiver import lifted_receiver
+from psdr_jit.boundary.lifted_receiver import Landing, lifted_receiver
 
 RIM = 0.4  # of a sphere sunk into the floor
 FROM = 0.05  # where the line has passed an edge, before it meets the floor
@@ -26,9 +28,10 @@ def received(scene: mi.Scene, x: float, ω: mi.Vector3f, passed: float = FROM):
     """The receiver of a line that meets the floor at x, on its way from an edge `passed` before."""
     edge = mi.Point3f(x, 0, 0) + passed * ω
     ray = mi.Ray3f(edge, -ω)
-    hit = scene.ray_intersect_preliminary(ray)
-    assert dr.all(dr.abs(hit.t - passed) < 1e-5)
-    return lifted_receiver(scene, None, edge, hit, ray, mi.Bool(True))
+    job = SimpleNamespace(scene=scene, surfaces=None)
+    met = Landing.of(job, ray, mi.Bool(True))
+    assert dr.all(dr.abs(met.pi.t - passed) < 1e-5)
+    return lifted_receiver(job, met, edge, mi.Bool(True))
 
 
 @pytest.mark.parametrize(

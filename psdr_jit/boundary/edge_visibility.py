@@ -1,0 +1,78 @@
+"""Does the sensor see edge points, and what lies so close in front of them that it might be their own surface?"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.lift import seen_side
+from ..core.varying import varying
+from ..edges.kind import Sight
+from ..edges.points import VISIBILITY_EPSILON
+from ..edges.table import EdgeTable
+from ..paths.rays import ROUNDING, see_through_emitters
+from ..paths.surface_at import surface_at
+from ..plan.job import Job
+
+
+def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool:
+    """Is there anything between the viewer and the edges? Hidden emitters are transparent. Detached.
+
+    Flat faces are all met where they are. A ray that touches a ball may meet it anywhere about its outline: there the
+    last of the way is gone a second time, and so it is where the edge does not say on which side of a surface it lies.
+    """
+    aim, body = table.aim(sight), table.body(sight)
+    ray = _between(sight.viewer, aim)
+    scale = ray.maxt + varying(mi.Float, job.facts.reach)
+    nearly = ray.maxt * (1 - VISIBILITY_EPSILON)
+    if _faceted(job):
+        blocked = _has_behind_it(job, ray, body, scale, active)
+        unsure = dr.any(body != aim)
+    else:
+        blocked = _meets(job, ray, nearly, active)
+        unsure = mi.Bool(True)
+    return blocked | _has_behind_it(job, _between(ray(nearly), body), body, scale, active & unsure & ~blocked)
+
+
+def _faceted(job: Job) -> bool:
+    """Do rays meet nothing but flat faces?"""
+    return all(shape.is_mesh or shape.plugin == "disk" or shape.kind == "instance" for shape in job.facts.shapes)
+
+
+def _between(o: mi.Point3f, x: mi.Point3f) -> mi.Ray3f:
+    """The way from `o` to `x`."""
+    way = x - o
+    length = dr.norm(way)
+    ray = mi.Ray3f(o, way / length)
+    ray.maxt = length
+    return ray
+
+
+def _has_behind_it(job: Job, ray: mi.Ray3f, body: mi.Point3f, scale: mi.Float, active: mi.Bool) -> mi.Bool:
+    """Do rays meet a surface that has `body` behind it by more than rounding?
+
+    `scale`: of the lengths that have been rounded [m]. Faces in line with the viewer are met as well, but the edge lies
+    in their plane.
+    """
+    pi = job.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    if job.options.hide_emitters:
+        ray, pi = see_through_emitters(job.scene, ray, pi)
+    si = surface_at(job.surfaces, pi, ray, mi.RayFlags.Minimal, active)
+    depth = dr.dot(seen_side(si, ray.d), si.p - body)
+    return active & pi.is_valid() & (depth > ROUNDING * scale)
+
+
+def _meets(job: Job, ray: mi.Ray3f, length: mi.Float, active: mi.Bool) -> mi.Bool:
+    """Do rays meet anything within a `length`?
+
+    They are gone from their end: one that touches a sphere is met at a distance from it that grows with the square of
+    how far away it starts, as `ray_test` of Mitsuba 3.9 calculates in single precision.
+    """
+    if job.options.hide_emitters:
+        ray = mi.Ray3f(ray)
+        ray.maxt = length
+        pi = job.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        return see_through_emitters(job.scene, ray, pi)[1].is_valid()
+    back = mi.Ray3f(ray(length), -ray.d)
+    back.maxt = length
+    return job.scene.ray_test(back, active)
