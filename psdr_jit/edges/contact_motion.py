@@ -42,16 +42,20 @@ def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
             if solid.index not in velocities:
                 velocities[solid.index] = _velocities(solid)
         if _parts(contact, velocities):
-            names = [f"'{shown_name(solid.mesh)}'" for solid in (contact.a, contact.b)]
-            what = f"parts of shape {names[0]}" if contact.a is contact.b else f"shapes {names[0]} and {names[1]}"
-            warn_once(
-                f"flush contact: {what} touch, and the motion parts them or presses them into each other. To one side "
-                "a gap opens, to the other it does not: in general the image has a kink here and no derivative, and "
-                "what is computed is that of neither side. Lift or sink one of them by "
-                f"{CLEAR * (1 + job.facts.reach):.1g} units, or slide it along the contact",
-                UnsupportedWarning,
-                job.call.memory,
-            )
+            say_parted(job, contact.a.mesh, contact.b.mesh)
+
+
+def say_parted(job: Job, a: mi.Shape, b: mi.Shape) -> None:
+    """Of two shapes (or one, whose parts touch) that the motion parts."""
+    names = f"parts of shape '{shown_name(a)}'" if a is b else f"shapes '{shown_name(a)}' and '{shown_name(b)}'"
+    warn_once(
+        f"flush contact: {names} touch, and the motion parts them or presses them into each other. To one side "
+        "a gap opens, to the other it does not: in general the image has a kink here and no derivative, and "
+        "what is computed is that of neither side. Lift or sink one of them by "
+        f"{CLEAR * (1 + job.facts.reach):.1g} units, or slide it along the contact",
+        UnsupportedWarning,
+        job.call.memory,
+    )
 
 
 def _velocities(solid: Solid) -> np.ndarray:
@@ -75,7 +79,7 @@ def _parts(contact: Contact, velocities: dict[int, np.ndarray]) -> bool:
     for k in range(2):  # both ends of the common part
         w = _on_edges(a, v_a, s.a, s.on_a[:, k]) - _on_edges(b, v_b, s.b, s.on_b[:, k])
         against.append(np.linalg.norm(w - along * np.sum(along * w, axis=1, keepdims=True), axis=1))
-    against += [_off_faces(*pair) for pair in ((a, v_a, b, v_b, contact.a_in_b), (b, v_b, a, v_a, contact.b_in_a))]
+    against += [off_faces(*pair) for pair in ((a, v_a, b, v_b, contact.a_in_b), (b, v_b, a, v_a, contact.b_in_a))]
     return bool(np.concatenate(against).max() > PARTING * fastest)
 
 
@@ -85,7 +89,7 @@ def _on_edges(mesh: TriangleMesh, values: np.ndarray, edge: np.ndarray, t: np.nd
     return start + t[:, None] * (end - start)
 
 
-def _off_faces(
+def off_faces(
     own: TriangleMesh, v: np.ndarray, other: TriangleMesh, v_other: np.ndarray, found: Resting
 ) -> np.ndarray:
     """Speeds at which the ends of stretches leave the faces that they lie in."""

@@ -48,6 +48,7 @@ from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import smooth_faces
 from .solids import Ball, Drum
+from .standing_rims import warn_about_lifted_rims
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -86,6 +87,7 @@ def edge_table(job: Job) -> EdgeTable:
     balls = tuple(ROUND[s.plugin](shapes[s.index], s.moves) for s in analytic if s.plugin in ROUND)
     straight = _edge_set(job, meshes, balls)
     warn_about_parting(job, straight.contacts)
+    warn_about_lifted_rims(job, shapes, chosen)
     kinds, hidden = _between_faces(job, straight, meshes, overlapping, centre)
     curves = _analytic(job, analytic, centre)
     if curves is not None:

@@ -66,6 +66,15 @@ def flat(x: float, half: float) -> dict:
     return {"type": "rectangle", "to_world": T().translate([x, 0, 0]).rotate([1, 0, 0], -90).scale(half)}
 
 
+def tube(bottom: float, top: float) -> dict:
+    return {"type": "cylinder", "p0": [0.1, bottom, 0.2], "p1": [0.1, top, 0.2], "radius": 0.4}
+
+
+def lid(height: float, radius: float) -> dict:
+    turned = T().translate([0.1, height, 0.2]).rotate([1, 0, 0], -90).rotate([0, 0, 1], 20)
+    return {"type": "disk", "to_world": turned.scale([radius, radius, 1])}
+
+
 def shapes_of(name: str) -> dict:
     """Two shapes, `moved` and `still`."""
     box, floor = ((0.1, 0.4, 0), (0.4, 0.4, 0.4)), flat(0, 3)
@@ -79,14 +88,22 @@ def shapes_of(name: str) -> dict:
         "tiles": lambda: {"still": flat(-1, 1), "moved": flat(1, 1)},
         "flush in front": lambda: {"still": cube((0, 0.3, 0), (0.6, 0.3, 0.5)),
                                    "moved": cube((0.3, 0.9, 0.2), (0.6, 0.3, 0.3))},
+        "cup on a floor": lambda: {"still": floor, "moved": tube(0, 0.7)},
+        "cup over a floor": lambda: {"still": floor, "moved": tube(0.01, 0.7)},
+        "under a cup": lambda: {"still": tube(0, 0.7), "moved": floor},
+        "cup on a round table": lambda: {"still": lid(0, 1.1), "moved": tube(0, 0.7)},
+        "lid of a tube": lambda: {"still": tube(-0.5, 0), "moved": lid(0, 0.4)},
     }[name]()  # fmt: skip
 
 
 AXES = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
 PARTED = ("on a floor: move y", "on a floor: turn x", "under a box: move y", "on a leg: turn z", "wall: move y",
-          "tiles: move x", "flush in front: move z")  # fmt: skip
+          "tiles: move x", "flush in front: move z", "cup on a floor: move y", "cup on a floor: turn x",
+          "under a cup: move y", "cup on a round table: move y", "lid of a tube: move y")  # fmt: skip
 FINE = ("on a floor: move x", "on a floor: turn y", "under a box: move x", "on a leg: turn y", "wall: move z",
-        "tiles: move z", "flush in front: move x", "above a floor: move y", "sunk into a floor: move y")  # fmt: skip
+        "tiles: move z", "flush in front: move x", "above a floor: move y", "sunk into a floor: move y",
+        "cup on a floor: move x", "cup on a floor: turn y", "cup over a floor: move y", "under a cup: move z",
+        "lid of a tube: move x")  # fmt: skip
 
 
 def edges_of(scene: mi.Scene, param: str, how: dict, **options):
@@ -112,7 +129,7 @@ def test_flush_shapes_that_are_parted_are_named(llvm):
     for case in PARTED + FINE:
         name, way, axis = case.replace(":", "").rsplit(" ", 2)
         shapes = shapes_of(name)
-        param = "moved.to_world" if shapes["moved"]["type"] == "rectangle" else "moved.vertex_positions"
+        param = "moved.vertex_positions" if shapes["moved"]["type"] == "cube" else "moved.to_world"
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             edges_of(scene_of(shapes), param, {"direction" if way == "move" else "rotate": AXES[axis]})
