@@ -127,7 +127,8 @@ def _searched(
         pair = lines.compare(at.sample, (start, end))
         segments += 2 * (pair.last + 1)
 
-        apart, checked = whole & pair.differs & pair.specular, search.mode == CHECK
+        # Without a width there is nothing to be found, whatever the ends are taken for.
+        apart, checked = whole & pair.differs & pair.specular & (start < end), search.mode == CHECK
         first = halve & pair.differs & (pair.moves | ~search.moves)  # what moves is sought rather than what rests
         hi = dr.select(apart | first, end, search.hi)
         lo = dr.select(apart, start, dr.select(halve & ~first, end, search.lo))

@@ -69,15 +69,17 @@ class ChainSurfaces:
         same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
         flat = self.is_flat(a, both & same)
         offset = b.p - a.p
-        side = dr.dot(a.n, d_a) * dr.dot(b.n, d_b) > 0
+        # not `> 0`: faces without area, which scanned meshes have, lack a normal, and no side of them differs
+        side = ~(dr.dot(a.n, d_a) * dr.dot(b.n, d_b) < 0)
+        one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
         near = COPLANAR_OFFSET * (a.t + b.t)
         one_plane = (dr.norm(dr.cross(a.n, b.n)) < COPLANAR_SINE) & (dr.dot(a.n, b.n) > 0)
         one_plane &= dr.abs(dr.dot(a.n, offset)) < near
+        one_plane |= one_face
         n_a, n_b = a.sh_frame.n, b.sh_frame.n
         off = dr.maximum(dr.abs(dr.dot(n_a, offset)), dr.abs(dr.dot(n_b, offset)))
-        shaded = dr.dot(n_a, d_a) * dr.dot(n_b, d_b) > 0
+        shaded = ~(dr.dot(n_a, d_a) * dr.dot(n_b, d_b) < 0)
         close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
-        one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
         if self.folds:
             close &= (k == 0) | ~a.shape.is_mesh() | (dr.norm(a.n - b.n) < ONE_NORMAL)
         one_curve = side & shaded & (one_face | close | _listed(self.round, a, both & same))

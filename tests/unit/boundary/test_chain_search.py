@@ -85,3 +85,22 @@ def test_a_lamp_is_found_without_weight(llvm):
     assert np.mean(weights[:, 0] == 1) > 0.8
     assert abs(weights[:, 0].mean() - 1) < 4 * weights[:, 0].std() / LINES**0.5
     assert np.mean(weights[:, 0] == weights[:, 1]) > 0.99
+
+
+class Unlike(Striped):
+    """Lines that end on a surface that is like nothing, itself included, as one whose normals are not numbers."""
+
+    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> Pair:
+        pair = super().compare(sample, ends)
+        last = 1 - 2 * self.least_width
+        pair.differs |= (ends[0] >= last) | (ends[1] >= last)
+        return pair
+
+
+def test_a_search_ends_where_nothing_is_alike(llvm):
+    """It went on for ever behind the last crossing, on a part of the line that has no width."""
+    start = np.linspace(0.1, 0.8, 50)
+    found = find_crossings(Unlike(start, 0.1, lamp=False, awkward=False)).at
+    lo, width = np.array(found.lo), np.array(found.hi - found.lo)
+    assert len(np.unique(np.array(found.sample)[lo > 0.95])) == len(start)
+    assert width.max() <= 2.0**-12
