@@ -55,8 +55,13 @@ def lifted_receiver(job: Job, landing: Landing, x: mi.Point3f, active: mi.Bool) 
     height = start_height(landing.p)
     # Along a line that grazes the surface we do not go so far back.
     lowered = height * dr.minimum(cos / LEAST_SLANT, 1)
-    above = height / dr.maximum(cos, LEAST_SLANT)
-    down = mi.Ray3f(landing.p - ray.d * above, -n, FAR_ENOUGH * lowered, 0, ray.wavelengths)
+    slant = dr.maximum(cos, LEAST_SLANT)
+    above = height / slant
+    # The line was traced a little beside the edge: next to one close above the surface that is no small distance.
+    beside = landing.p - x
+    beside -= ray.d * dr.dot(ray.d, beside)
+    end = landing.p - beside - ray.d * (dr.dot(n, beside) / slant)
+    down = mi.Ray3f(end - ray.d * above, -n, FAR_ENOUGH * lowered, 0, ray.wavelengths)
     below = job.scene.ray_intersect_preliminary(down, coherent=False, active=active & pi.is_valid() & (cos > 0))
     found = below.is_valid() & (dr.dot(n, x - landing.p) > lowered)
     # What a large face is met at is rounded: it is the face itself, wherever that is.

@@ -17,7 +17,10 @@ from .points import clear_of_lift
 
 T = TypeVar("T")
 
-#: Distance behind an outline up to which what it hides is looked at from farther aside, in heights at which rays start.
+#: Share of the way from an edge to what is close behind it at which a line along it starts.
+HALFWAY = 0.5
+
+#: Distance behind an outline up to which what it hides is looked at once more, in heights at which rays start.
 NEXT_TO_OUTLINE = 100.0
 
 
@@ -89,9 +92,7 @@ class EdgeTable:
         return self.ask(sight.at.row, lambda kind, row, own: kind.side(row, sight, which, own))
 
 
-def look_beside(
-    scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt32, wavelengths, coherent: bool = False
-):
+def look_beside(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt32, wavelengths, coherent: bool = False):
     """What lies on side `which` of edges: `(ray, pi, differs)`; own faces are known, the rest is traced.
 
     `differs` is False where both sides are certainly alike. `coherent`: rays of neighbouring lanes are nearly alike,
@@ -119,9 +120,11 @@ def look_behind(scene: mi.Scene, table: EdgeTable, sight: Sight, which: mi.UInt3
 def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengths, coherent: bool = False):
     """What lies on a side: `(ray, pi)`, traced where `wanted`.
 
-    Another shape next to an outline is looked at once more, from farther aside, where rays cannot start there as they
+    Another shape next to an outline is looked at once more. From farther aside, where rays cannot start there as they
     start elsewhere: at their height they are behind what they should pass. Nothing else is, for that far aside the
-    next fold of the shape, or the gap below it, may have ended as well.
+    next fold of the shape, or the gap below it, may have ended as well. Elsewhere along the line itself, from behind
+    the edge on: how bright a wall is next to a board that hangs before it changes within that distance, times the
+    slant of the line.
     """
     ray, asked = side.ray, side.traced & wanted
     ray.wavelengths = wavelengths
@@ -129,10 +132,14 @@ def traced(scene: mi.Scene, side: Side, sight: Sight, wanted: mi.Bool, wavelengt
     beyond = dr.dot(ray.o + found.t * ray.d - sight.at.x, ray.d)
     again = asked & found.is_valid() & (beyond < NEXT_TO_OUTLINE * clear_of_lift(sight.at.x)) & dr.any(side.aside != 0)
     again &= dr.reinterpret_array(mi.UInt32, found.shape) != side.shape
-    again &= rays_start_behind(scene, sight.at.x, ray, found, again)
-    ray.o = dr.select(again, ray.o + side.aside, ray.o)
-    found = dr.select(again, scene.ray_intersect_preliminary(ray, coherent=coherent, active=again), found)
-    return ray, dr.select(side.traced, found, side.pi)
+    behind = rays_start_behind(scene, sight.at.x, ray, found, again)
+    other = mi.Ray3f(ray)
+    other.o = dr.select(behind, ray.o + side.aside, sight.at.x + HALFWAY * beyond * ray.d)
+    met = scene.ray_intersect_preliminary(other, coherent=coherent, active=again)
+    # Rays along a line that touches a curved shape do not start clear of it.
+    again &= behind | (met.is_valid() & (met.shape == found.shape) & (sight.at.scale == 0))
+    ray.o = dr.select(again, other.o, ray.o)
+    return ray, dr.select(side.traced, dr.select(again, met, found), side.pi)
 
 
 def rays_start_behind(

@@ -101,3 +101,27 @@ def test_a_board_behind_the_face_of_a_post(mono, inset, hide_emitters):
     scene = room(post=post, body={"type": "cube", "to_world": board, "bsdf": sheet(0.8, False)})
     motion = perturb(scene, "sensor.to_world", (1, 0, 0))
     assert_by_blocks(motion, 0.01, 1024, hide_emitters=hide_emitters)
+
+
+def plate(gap: float, wall: float) -> mi.Scene:
+    """It hangs before a wall, and is looked at from one side, so that one sees the wall behind its far edge."""
+    film = {"type": "hdrfilm", "width": 48, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    place = T().translate([0, 0, gap + 0.06]).scale([1, 4, 0.06])
+    return mi.load_dict({
+        "type": "scene", "wall": {"type": "rectangle", "to_world": T().scale(wall), "bsdf": sheet(0.6, False)},
+        "body": {"type": "cube", "to_world": place, "bsdf": sheet(0.1, False)}, "sky": {"type": "constant"},
+        "sensor": {"type": "orthographic", "to_world": T().look_at([4, 0, 20], [0, 0, 0], UP).scale([2, 2, 1]),
+                   "film": film},
+    }, optimize=False)  # fmt: skip
+
+
+@pytest.mark.parametrize("wall", [40.0, 300.0])
+def test_a_plate_before_a_large_wall(mono, wall):
+    """At its far edge the wall is darkest, within a quarter of the gap. As lines passed the edge at a distance that is
+    small for the wall alone, that was counted twice: 2.1 and 2.6 % of all the plate's right side brings.
+    """
+    motion = perturb(plate(0.003, wall), "body.vertex_positions", (1, 0, 0))
+    spec = SPEC | {"max_depth": 2}
+    images = forward(motion, spec, 4, 512), fd(motion, spec, 0.01, 4, 4096)
+    a, b = (image.squeeze().mean((0, 1))[24:].sum() for image in images)
+    assert abs(a / b - 1) < 0.012, a / b
