@@ -15,7 +15,11 @@ from psdr_jit.derivative.statistics import block_means
 SPP, SEEDS, RES, BLOCK = 256, 8, 20, 4
 SPEC = {"type": "psdr_path", "max_depth": 3}
 UP = [0, 1, 0]
-GAPS = (1e-5, 3e-4, 3e-3)
+
+
+def also(value: float):
+    """A case of the slow tests alone."""
+    return pytest.param(value, marks=pytest.mark.slow)
 
 
 def T():
@@ -74,7 +78,7 @@ def assert_by_blocks(motion, step: float, spp: int, **options) -> None:
     assert np.sqrt(np.sum((a - b) ** 2) / np.sum(b**2)) < 0.025 + noise
 
 
-@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("gap", [also(1e-5), 3e-4, also(3e-3)])
 @pytest.mark.parametrize("what", ["rug", "coin", "card", "box", "tube"])
 @pytest.mark.parametrize("moved", ["sensor.to_world", "body"])
 def test_above_a_floor(mono, what, gap, moved):
@@ -85,7 +89,7 @@ def test_above_a_floor(mono, what, gap, moved):
 
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
-@pytest.mark.parametrize("overhang", [3e-4, 3e-3, 3e-2])
+@pytest.mark.parametrize("overhang", [also(3e-4), 3e-3, also(3e-2)])
 def test_a_table_top(mono, overhang, hide_emitters):
     """The rim of the leg touches it from below: 18 to 5 % too much where that was seen through the top."""
     motion = perturb(room(**body("table", overhang)), "sensor.to_world", (1, 0, 0.3))
@@ -93,7 +97,7 @@ def test_a_table_top(mono, overhang, hide_emitters):
 
 
 @pytest.mark.parametrize("hide_emitters", [False, True])
-@pytest.mark.parametrize("inset", [1e-4, 1e-3])
+@pytest.mark.parametrize("inset", [1e-4, also(1e-3)])
 def test_a_board_behind_the_face_of_a_post(mono, inset, hide_emitters):
     """Its end is inside of the post, and a hair behind the face is behind it: 35 %."""
     post = {"type": "cube", "to_world": T().translate([-0.4, 0.5, 0]).scale([0.2, 0.5, 0.2]), "bsdf": sheet(0.5, False)}
