@@ -69,7 +69,7 @@ class ChainSurfaces:
         same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
         flat = self.is_flat(a, both & same)
         offset = b.p - a.p
-        # not `> 0`: faces without area, which scanned meshes have, lack a normal, and no side of them differs
+        # not `> 0`: meshes in the wild have normals that are 0 or not numbers, and no side of theirs differs
         side = ~(dr.dot(a.n, d_a) * dr.dot(b.n, d_b) < 0)
         one_face = a.shape.is_mesh() & (a.prim_index == b.prim_index)
         near = COPLANAR_OFFSET * (a.t + b.t)

@@ -39,7 +39,7 @@ def _jumps(job: Job, aovs: Aovs, edges: FilmEdges, sample: primary.EdgeSample) -
     index = dr.arange(mi.UInt32, 2 * n)
     which, s = index & 1, dr.gather(primary.EdgeSample, sample, index >> 1)
     seen = primary.seen_edge(job, edges, s)
-    ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, dr.zeros(mi.Color0f))
+    ray, pi, differs = look_beside(job.scene, edges.table, seen.sight, which, dr.zeros(mi.Color0f), coherent=True)
     si = surface_at(job.surfaces, pi, ray, mi.RayFlags.All, differs)
     values = [dr.select(differs, value, 0) for value in aovs.values(si, seen.view.o)]
     dr.eval(values)

@@ -7,6 +7,8 @@ Sliding along the contact is fine. Needs the direction of the derivative, which 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -19,7 +21,7 @@ from ..plan.job import Job
 from ..scene.names import shown_name
 from .contacts import Contact
 from .intersections import TriangleMesh, barycentric, unit_normals
-from .solids import Solid, triangles
+from .solids import triangles
 from .touching import Resting
 
 #: Relative speed that counts as parting, relative to the largest speed of the two shapes: rounding is far below.
@@ -40,7 +42,7 @@ def warn_about_parting(job: Job, contacts: tuple[Contact, ...]) -> None:
             continue
         for solid in (contact.a, contact.b):
             if solid.index not in velocities:
-                velocities[solid.index] = _velocities(solid)
+                velocities[solid.index] = vertex_velocities(solid.mesh)
         if _parts(contact, velocities):
             say_parted(job, contact.a.mesh, contact.b.mesh)
 
@@ -58,10 +60,15 @@ def say_parted(job: Job, a: mi.Shape, b: mi.Shape) -> None:
     )
 
 
-def _velocities(solid: Solid) -> np.ndarray:
-    """(V, 3) of the vertices."""
+def vertex_velocities(mesh: mi.Mesh) -> np.ndarray:
+    """(V, 3) of the vertices of a mesh, on the host."""
+    return velocities_of(lambda: mesh_positions(mesh))
+
+
+def velocities_of(points: Callable[[], mi.Point3f]) -> np.ndarray:
+    """(N, 3) of points that are attached to what moves, on the host."""
     with dr.resume_grad():
-        found = tangents(mesh_positions(solid.mesh))
+        found = tangents(points())
     return np.array(mi.Vector3f(found), float).T
 
 
@@ -89,9 +96,7 @@ def _on_edges(mesh: TriangleMesh, values: np.ndarray, edge: np.ndarray, t: np.nd
     return start + t[:, None] * (end - start)
 
 
-def off_faces(
-    own: TriangleMesh, v: np.ndarray, other: TriangleMesh, v_other: np.ndarray, found: Resting
-) -> np.ndarray:
+def off_faces(own: TriangleMesh, v: np.ndarray, other: TriangleMesh, v_other: np.ndarray, found: Resting) -> np.ndarray:
     """Speeds at which the ends of stretches leave the faces that they lie in."""
     corners = other.corners(found.face)
     n = unit_normals(corners)

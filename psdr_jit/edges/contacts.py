@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.memory import Memory, Slot, key_of
 from . import intersections as cut
-from .overlaps import box_of
+from .overlaps import box_of, touching_boxes
 from .solids import Solid, state_of, triangles
 from .topology import INVALID, WELD_TOLERANCE
 from .touching import Resting, Shared, parts_in_faces, shared_parts
@@ -42,7 +42,8 @@ CONTACTS: Slot[dict[tuple[str | int, str | int], tuple]] = Slot(dict)
 def find_contacts(solids: list[Solid], memory: Memory) -> list[Contact]:
     """All contacts; pairs whose meshes have not been written to are taken from `memory`."""
     found = []
-    for a, b in _touching(solids) + [(s, s) for s in solids if s.parts or s.topology.border.any()]:
+    near = [(solids[i], solids[j]) for i, j in touching_boxes([box_of(solid.mesh) for solid in solids])]
+    for a, b in near + [(s, s) for s in solids if s.parts or s.topology.border.any()]:
         key, state = (key_of(a.mesh), key_of(b.mesh)), (state_of(a), state_of(b))
         known = memory[CONTACTS].get(key)
         if known is None or [s.key for s in known[0]] != [s.key for s in state]:
@@ -53,20 +54,9 @@ def find_contacts(solids: list[Solid], memory: Memory) -> list[Contact]:
     return found
 
 
-def _touching(solids: list[Solid]) -> list[tuple[Solid, Solid]]:
-    """Pairs whose boxes touch."""
-    if len(solids) < 2:
-        return []
-    lower, upper = np.stack([box_of(solid.mesh) for solid in solids], axis=1)
-    i, j = np.triu_indices(len(solids), 1)
-    tol = cut.RESTING * (np.abs(np.stack([lower, upper])).max() + np.linalg.norm(upper - lower, axis=1).max())
-    near = np.all(np.maximum(lower[i], lower[j]) <= np.minimum(upper[i], upper[j]) + tol, axis=1)
-    return [(solids[p], solids[q]) for p, q in zip(i[near], j[near], strict=True)]
-
-
 def _between(a: Solid, b: Solid) -> Contact | None:
     mesh_a, mesh_b = triangles(a), triangles(b)
-    tol = WELD_TOLERANCE * max(np.linalg.norm(m.box[1] - m.box[0]) + np.abs(m.box).max() for m in (mesh_a, mesh_b))
+    tol = cut.tolerance(mesh_a.box, mesh_b.box, relative=WELD_TOLERANCE)
     common = cut.overlap(mesh_a.box, mesh_b.box, tol)
     if common is None:
         return None
@@ -88,7 +78,7 @@ def _within(solid: Solid) -> Contact | None:
     several = solid.parts and len(t) <= MAX_EDGES
     edges = _seen(mesh, np.arange(len(t))) if several else np.flatnonzero(t.border)
     ends = _ends(mesh, edges)
-    tol = WELD_TOLERANCE * (np.linalg.norm(mesh.box[1] - mesh.box[0]) + np.abs(mesh.box).max())
+    tol = cut.tolerance(mesh.box, relative=WELD_TOLERANCE)
     shared = shared_parts(ends, ends, tol)
     once = shared.a < shared.b
     if not once.any():

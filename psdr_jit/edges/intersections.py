@@ -69,9 +69,9 @@ class Segments:
     end: np.ndarray
 
 
-def tolerance(*boxes: np.ndarray) -> float:
+def tolerance(*boxes: np.ndarray, relative: float = RESTING) -> float:
     """Absolute distance below which surfaces within these boxes count as touching."""
-    return RESTING * max(np.abs(box).max() + np.linalg.norm(box[1] - box[0]) for box in boxes)
+    return relative * max(np.abs(box).max() + np.linalg.norm(box[1] - box[0]) for box in boxes)
 
 
 def overlap(box_a: np.ndarray, box_b: np.ndarray, margin: float) -> np.ndarray | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -31,6 +32,17 @@ def box_of(shape: mi.Shape) -> np.ndarray:
 def apart(lower, upper, box: mi.ScalarBoundingBox3f) -> bool:
     """Does the box with these corners not even touch `box`?"""
     return any(lower[i] > box.max[i] or upper[i] < box.min[i] for i in range(3))
+
+
+def touching_boxes(boxes: Sequence[np.ndarray]) -> list[tuple[int, int]]:
+    """Pairs i < j of boxes (2, 3) that touch."""
+    if len(boxes) < 2:
+        return []
+    lower, upper = np.stack(boxes, axis=1)
+    i, j = np.triu_indices(len(boxes), 1)
+    tol = RESTING * (np.abs(np.stack([lower, upper])).max() + np.linalg.norm(upper - lower, axis=1).max())
+    near = np.all(np.maximum(lower[i], lower[j]) <= np.minimum(upper[i], upper[j]) + tol, axis=1)
+    return list(zip(i[near].tolist(), j[near].tolist(), strict=True))
 
 
 def crossing(boxes: list[np.ndarray]) -> list[tuple[int, int]]:

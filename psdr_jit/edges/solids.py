@@ -79,7 +79,11 @@ def _matrix(shape: mi.Shape) -> np.ndarray:
 
 def triangles(solid: Solid) -> TriangleMesh:
     """The mesh on the host: copies of its arrays, no kernel."""
-    positions = np.array(dr.detach(positions_buffer(solid.mesh))).reshape(-1, 3)
-    faces = np.array(faces_buffer(solid.mesh)).reshape(-1, 3)
     t = solid.topology
-    return TriangleMesh(positions, faces, np.stack([t.v0, t.v1], 1), np.stack([t.f0, t.f1], 1))
+    return TriangleMesh(*corners_and_faces(solid.mesh), np.stack([t.v0, t.v1], 1), np.stack([t.f0, t.f1], 1))
+
+
+def corners_and_faces(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (V, 3) and faces (F, 3) on the host, detached."""
+    positions = np.array(dr.detach(positions_buffer(mesh))).reshape(-1, 3)
+    return positions, np.array(faces_buffer(mesh)).reshape(-1, 3)

@@ -6,7 +6,7 @@ Rims stand for polygons, and disks for fans of triangles about them. Needs the d
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,21 +14,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.ad import tangents
-from ..core.compat import faces_buffer, mesh_positions, positions_buffer
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
-from .contact_motion import PARTING, off_faces, say_parted
-from .intersections import TriangleMesh, overlap
-from .overlaps import box_of
+from .contact_motion import PARTING, off_faces, say_parted, velocities_of, vertex_velocities
+from .intersections import TriangleMesh, tolerance
+from .overlaps import box_of, touching_boxes
+from .solids import corners_and_faces
 from .topology import INVALID, WELD_TOLERANCE
-from .touching import Resting, parts_in_faces
+from .touching import parts_in_faces
 
 #: Corners of the polygon that a rim stands for.
 CORNERS = 48
 
 #: Heights at which the rims of a plugin are, in its own space.
 RIMS = {"disk": (0.0,), "cylinder": (0.0, 1.0)}
+
+#: Sides of such a polygon, by corners.
+_RING = np.stack([np.arange(CORNERS), (np.arange(CORNERS) + 1) % CORNERS], 1)
 
 
 @dataclass(frozen=True)
@@ -41,14 +43,9 @@ class _Body:
 
     @cached_property
     def rims(self) -> TriangleMesh:
-        """Edges alone; of a mesh none."""
-        heights = RIMS.get(self.plugin, ())
-        points = [_in_world(self.shape, _circle(height)) for height in heights]
-        corner = np.arange(CORNERS)
-        ring = np.stack([corner, (corner + 1) % CORNERS], 1)
-        edges = [ring + k * CORNERS for k in range(len(heights))]
-        edges = np.concatenate([np.zeros((0, 2), int), *edges])
-        positions = np.concatenate([np.zeros((0, 3)), *points])
+        """Edges alone. Not of a mesh."""
+        edges = np.concatenate([_RING + k * CORNERS for k in range(len(RIMS[self.plugin]))])
+        positions = _in_world(self.shape, _circles(self.plugin))
         return TriangleMesh(positions, np.zeros((0, 3), int), edges, np.full_like(edges, INVALID))
 
     @cached_property
@@ -56,74 +53,57 @@ class _Body:
         """Faces alone; of a cylinder none."""
         none = np.zeros((0, 2), int)
         if self.shape.is_mesh():
-            positions = np.array(dr.detach(positions_buffer(self.shape))).reshape(-1, 3)
-            return TriangleMesh(positions, np.array(faces_buffer(self.shape)).reshape(-1, 3), none, none)
+            return TriangleMesh(*corners_and_faces(self.shape), none, none)
         if self.plugin != "disk":
             return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int), none, none)
-        corner = np.arange(CORNERS)
-        fan = np.stack([corner, (corner + 1) % CORNERS, np.full(CORNERS, CORNERS)], 1)
+        fan = np.concatenate([_RING, np.full((CORNERS, 1), CORNERS)], 1)
         return TriangleMesh(_in_world(self.shape, _fan()), fan, none, none)
 
     @cached_property
     def speed_of_rims(self) -> np.ndarray:
         """(V, 3) of the corners of `rims`."""
-        points = [_circle(height) for height in RIMS.get(self.plugin, ())]
-        return np.concatenate([np.zeros((0, 3)), *(_speed(self.shape, x) for x in points)])
+        return _speed(self.shape, _circles(self.plugin))
 
     @cached_property
     def speed_of_faces(self) -> np.ndarray:
         """(V, 3) of the corners of `faces`."""
-        if not self.shape.is_mesh():
-            return _speed(self.shape, _fan())
-        with dr.resume_grad():
-            found = tangents(mesh_positions(self.shape))
-        return np.array(mi.Vector3f(found), float).T
+        return vertex_velocities(self.shape) if self.shape.is_mesh() else _speed(self.shape, _fan())
 
 
 def warn_about_lifted_rims(job: Job, shapes: Sequence[mi.Shape], chosen: Sequence[ShapeFacts]) -> None:
     """Name shapes of which one stands on the other by a rim, and leaves it, each pair once. `chosen`: of `shapes`."""
-    if job.call.mode != "forward" or not any(s.plugin in RIMS and not s.is_mesh for s in chosen):
+    if job.call.mode != "forward" or not any(s.plugin in RIMS for s in chosen):
         return
-    bodies = [_Body(shapes[s.index], "mesh" if s.is_mesh else s.plugin, s.moves) for s in chosen]
-    boxes = [box_of(body.shape) for body in bodies]
-    for i, j in _near([body.plugin in RIMS for body in bodies], boxes):
-        own, other = bodies[i], bodies[j]
-        if (own.moves or other.moves) and _leaves(own, other):
-            say_parted(job, own.shape, other.shape)
-
-
-def _near(has_rims: list[bool], boxes: list[np.ndarray]) -> Iterator[tuple[int, int]]:
-    """Pairs of a shape with rims and another one whose boxes touch."""
-    for i in np.flatnonzero(has_rims):
-        for j in range(len(boxes)):
-            if i != j and overlap(boxes[i], boxes[j], _slack(boxes[i], boxes[j])) is not None:
-                yield i, j
-
-
-def _slack(*boxes: np.ndarray) -> float:
-    """Distance that counts as none."""
-    return WELD_TOLERANCE * max(np.linalg.norm(box[1] - box[0]) + np.abs(box).max() for box in boxes)
+    bodies = [_Body(shapes[s.index], s.plugin, s.moves) for s in chosen]
+    for i, j in touching_boxes([box_of(body.shape) for body in bodies]):
+        a, b = bodies[i], bodies[j]
+        if (a.moves or b.moves) and (_leaves(a, b) or _leaves(b, a)):
+            say_parted(job, a.shape, b.shape)
 
 
 def _leaves(own: _Body, other: _Body) -> bool:
     """Do rims of `own` lie in faces of `other`, and move off these?"""
-    if not len(own.rims.edges) or not len(other.faces.faces):
+    if own.plugin not in RIMS or not len(other.faces.faces):
         return False
     ends = own.rims.positions[own.rims.edges]
-    slack = _slack(own.rims.box, other.faces.box)
+    slack = tolerance(own.rims.box, other.faces.box, relative=WELD_TOLERANCE)
     found = parts_in_faces(ends, other.faces.positions[other.faces.faces].astype(float), slack)
     if not len(found.edge):
         return False
     v, v_other = own.speed_of_rims, other.speed_of_faces
     fastest = max(np.linalg.norm(x, axis=1).max() for x in (v, v_other))
-    at = Resting(found.edge, found.face, found.on_edge)
-    return bool(off_faces(own.rims, v, other.faces, v_other, at).max() > PARTING * fastest)
+    return bool(off_faces(own.rims, v, other.faces, v_other, found).max() > PARTING * fastest)
 
 
 def _circle(height: float) -> np.ndarray:
     """(CORNERS, 3) on the rim, in the shape's own space."""
     angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
     return np.stack([np.cos(angle), np.sin(angle), np.full(CORNERS, height)], 1)
+
+
+def _circles(plugin: str) -> np.ndarray:
+    """(R · CORNERS, 3) on all R rims."""
+    return np.concatenate([_circle(height) for height in RIMS[plugin]])
 
 
 def _fan() -> np.ndarray:
@@ -138,9 +118,7 @@ def _in_world(shape: mi.Shape, x: np.ndarray) -> np.ndarray:
 
 def _speed(shape: mi.Shape, x: np.ndarray) -> np.ndarray:
     """(N, 3) of points that move with the shape."""
-    with dr.resume_grad():
-        found = tangents(_attached(shape, x))
-    return np.array(mi.Vector3f(found), float).T
+    return velocities_of(lambda: _attached(shape, x))
 
 
 def _attached(shape: mi.Shape, x: np.ndarray) -> mi.Point3f:
