@@ -37,6 +37,7 @@ from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.followed_lights import is_followed
 from ..options import Options
+from ..paths.surface_at import surface_at
 from ..paths.walk import NoSink, walk
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
@@ -127,7 +128,7 @@ def _light_step(job: Job, pair: Pair, chain: ChainRecords, wavelengths) -> tuple
     """Of shadow rays: `(L_a − L_b times the path's throughput, the one that is not blocked, its length)`."""
     hit = chain.segment(pair.k, pair.in_light)
     ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
-    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, pair.in_light)
+    si = surface_at(job.surfaces, hit.intersection(), ray, mi.RayFlags.All, pair.in_light)
     source = dr.select(pair.seen, pair.a, pair.b)
     towards = pair.light.towards(si, pair.in_light)
     value = pair.light.scattered(si, towards, source, pair.in_light) * dr.select(pair.seen, 1, -1) * pair.β_a
@@ -146,14 +147,14 @@ def _steps(job: Job) -> tuple[Steps, ChainRecords] | None:
     line = lines.line(found.at.sample)
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     lit, source, distance = _light_step(job, pair, chain, wavelengths)
-    pair = beside_curve(job.scene, lines.world.patterns, pair, curve)
+    pair = beside_curve(lines.world, pair, curve)
     ΔL = (_radiances(job, pair, wavelengths) + lit) * weight
     end = End(pair.sight, curve, pair.in_light, pair.light, source, distance)
 
     p = line.at(found.at.lo)
     valid, step = step_per_slope(lines, chain, end, (p, line), lambda q: _first(lines, chain, line, q))
     if lines.world.surfaces.horizons:
-        valid &= ~sampled_as_edge(pair, curve.line)
+        valid &= ~sampled_as_edge(lines.world, pair, curve.line)
     per_F = dr.select(valid, step * found.at.weight / lines.per_pixel(found.at.sample), 0)
     steps = Steps(p, lines.film(p), line.aperture, end, ΔL * per_F, wavelengths, valid)
     dr.eval(steps)

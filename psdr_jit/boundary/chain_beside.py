@@ -14,9 +14,10 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..edges.points import LEAST_SLANT, clear_of_lift
+from ..paths.surface_at import surface_of
 from .chain_outline import Curve, edge_outline, triangle
-from .chain_patterns import INSET, ChainPatterns
-from .chain_trace import Pair
+from .chain_patterns import INSET
+from .chain_trace import ChainWorld, Pair
 
 #: How far from an edge, as a share of its distance from the face's centroid, the other face is looked for, ...
 PROBE = 0.1
@@ -28,25 +29,25 @@ PROBE_HEIGHT = 0.01
 SAME_EDGE = 0.02
 
 
-def beside_curve(scene: mi.Scene, patterns: ChainPatterns | None, pair: Pair, curve: Curve) -> Pair:
+def beside_curve(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     """The last segments clear of a crossed line of a pattern, of a cut, or of a sharp edge; others as they are."""
-    if patterns is not None:
-        pair = _beside_line(scene, pair, curve)
-    pair = _beside_sharp_edges(scene, _beside_cut(scene, pair, curve))
+    if world.patterns is not None:
+        pair = _beside_line(world, pair, curve)
+    pair = _beside_sharp_edges(world.scene, _beside_cut(world, pair, curve))
     dr.eval(pair)  # in one kernel: what follows is asked for one by one
     return pair
 
 
-def _beside_line(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+def _beside_line(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     """Where a line of a pattern has been crossed: both last segments moved off it, in parallel."""
-    si = pair.a.interaction(curve.pattern)
+    si = surface_of(world.tables, pair.a, curve.pattern)
     across = curve.g * (INSET / dr.squared_norm(curve.g))
     step = si.dp_du * across.x + si.dp_dv * across.y
     crossed = curve.pattern & dr.all(dr.isfinite(step))
-    return _both_moved(scene, pair, curve.side * step, crossed)
+    return _both_moved(world.scene, pair, curve.side * step, crossed)
 
 
-def _beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
+def _beside_cut(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     """Where surfaces cut: both last segments moved off the curve, in parallel, until rounding no longer decides.
 
     Rays that leave a surface start off it, and a point beside a cut is known to a few units in the last place: closer
@@ -55,10 +56,10 @@ def _beside_cut(scene: mi.Scene, pair: Pair, curve: Curve) -> Pair:
     """
     n = mi.Vector3f(curve.c1 + curve.c2)
     crossed = curve.cut & ~pair.in_light & dr.isfinite(curve.side)
-    n_a, n_b = (hit.interaction().n for hit in (pair.a, pair.b))
+    n_a, n_b = (surface_of(world.tables, hit).n for hit in (pair.a, pair.b))
     cot = dr.abs(dr.dot(n_a, n_b)) / dr.maximum(dr.norm(dr.cross(n_a, n_b)), LEAST_SLANT)
     x = curve.line.o + curve.t * curve.line.d
-    return _both_moved(scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
+    return _both_moved(world.scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
 
 
 def _beside_sharp_edges(scene: mi.Scene, pair: Pair) -> Pair:

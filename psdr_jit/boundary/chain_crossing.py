@@ -15,10 +15,11 @@ import mitsuba as mi
 from ..core.ad import backpropagate, tangents
 from ..core.records import Hit
 from ..paths.rays import ROUNDING
+from ..paths.surface_at import surface_of
 from .chain_outline import Curve, crossed_curve
 from .chain_patterns import NO_FAMILY
 from .chain_sweeps import AtRest, slope_at_end
-from .chain_trace import ChainRecords, Pair
+from .chain_trace import ChainRecords, ChainWorld, Pair
 from .searched_lines import SearchedLines
 
 #: Largest distance on the film from a crossing to the curve that it is thought to belong to [px, or cells]: halving
@@ -32,13 +33,13 @@ def crossings(lines: SearchedLines, found) -> tuple[ChainRecords, Pair, Curve]:
     pair = lines.compare(found.at.sample, (found.at.lo, found.at.hi), chain)
     dr.eval(pair, chain.hits, chain.bends)
     sight = dr.select(pair.horizon, chain.segment(pair.sight, pair.horizon), pair.a)
-    curve = crossed_curve(lines.analytic, lines.world.patterns, pair, sight)
-    curve.valid &= ~starts_behind(pair)
+    curve = crossed_curve(lines.world, lines.analytic, pair, sight)
+    curve.valid &= ~starts_behind(lines.world, pair)
     dr.eval(curve)
     return chain, pair, curve
 
 
-def starts_behind(pair: Pair) -> mi.Bool:
+def starts_behind(world: ChainWorld, pair: Pair) -> mi.Bool:
     """Do the paths part because one of them begins its segment behind the face of a mesh that the other meets?
 
     Rays start a small height off their surfaces. Inside of a body with a sharp edge, as near to it as that height, they
@@ -48,18 +49,18 @@ def starts_behind(pair: Pair) -> mi.Bool:
     first = (a.shape != 0) & ((b.shape == 0) | (a.t < b.t))
     met, other = dr.select(first, a, b), dr.select(first, b, a)
     asked = (met.shape != 0) & (pair.last > 0) & ~pair.horizon & (pair.family == NO_FAMILY)
-    si = met.interaction(asked, mi.RayFlags.Minimal)
+    si = surface_of(world.tables, met, asked, mi.RayFlags.Minimal)
     rounding = ROUNDING * (1 + dr.max(dr.abs(si.p)))
     behind = dr.mulsign(dr.dot(si.n, si.p - other.o), dr.dot(si.n, met.d)) <= rounding
     return asked & si.shape.is_mesh() & behind
 
 
-def sampled_as_edge(pair: Pair, sight: Hit) -> mi.Bool:
+def sampled_as_edge(world: ChainWorld, pair: Pair, sight: Hit) -> mi.Bool:
     """Is the crossing left to `primary`? Horizons that the camera sees are if a mirror reflects along its face there
     (`edges.kind_mirror_horizon`), or if they lie on an edge. `sight`: the segment that meets the crossed curve.
     """
     seen = pair.horizon & (pair.sight == 0)
-    si = sight.interaction(seen)
+    si = surface_of(world.tables, sight, seen)
     reflected = dr.dot(si.sh_frame.n, pair.a.d) * dr.dot(si.sh_frame.n, sight.d) < 0
     return seen & (reflected | ~pair.one_face)
 
@@ -83,7 +84,8 @@ def _slope(lines: SearchedLines, chain: ChainRecords, end, p: mi.Point2f, axis: 
     with dr.resume_grad(q):
         dr.set_grad(q, mi.Point2f(1 - axis, axis))
         o_grad, d_grad = tangents(*first(q))
-    return slope_at_end(lines.job.facts, chain, end, (o_grad, d_grad), AtRest(lines.job.sensor))
+    still = AtRest(lines.job.sensor, lines.job.surfaces)
+    return slope_at_end(lines.job.facts, chain, end, (o_grad, d_grad), still)
 
 
 def adjoint_of_speed(splat: Callable[[mi.Float], mi.TensorXf], count: int, grad_in: mi.TensorXf) -> mi.Float:

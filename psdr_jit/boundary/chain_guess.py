@@ -17,6 +17,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
+from ..paths.surface_at import surface_of
+from ..scene.surfaces import Surfaces
 from .chain_outline import SIDES, AnalyticShapes, triangle
 from .chain_patterns import NO_FAMILY
 from .chain_surface import NOWHERE
@@ -68,6 +70,7 @@ class Guesses:
     """What is asked of where chains part. Host object."""
 
     analytic: AnalyticShapes | None
+    tables: Surfaces | None  # what Mitsuba does not evaluate
     smooth: bool  # are there surfaces with shading normals?
 
     def where(self, pair: Pair, active: mi.Bool) -> mi.Float:
@@ -98,8 +101,7 @@ class Guesses:
         share = self.where(pair, active)
         return dr.select(share >= 0, start + share * (end - start), NOWHERE)
 
-    @staticmethod
-    def _turned(hit: Hit, active: mi.Bool) -> mi.Float:
+    def _turned(self, hit: Hit, active: mi.Bool) -> mi.Float:
         """n·d of the shading normal."""
-        si = hit.interaction(active)
+        si = surface_of(self.tables, hit, active)
         return dr.dot(si.sh_frame.n, hit.d)

@@ -26,13 +26,15 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..edges.curves import CURVES_OF, local_viewpoint, transform_point, transform_vector
 from ..paths.delta_step import delta_step
+from ..paths.surface_at import surface_of
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
 from ..scene.poses import Poses
 from ..scene.registry import registry_values
-from .chain_patterns import NO_FAMILY, ChainPatterns
-from .chain_trace import Pair
+from .chain_contour import Outline, contour, resting
+from .chain_patterns import NO_FAMILY
+from .chain_trace import ChainWorld, Pair
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
 TOUCHING = 1e-3
@@ -48,15 +50,6 @@ CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 
 #: Its sides, by their ends.
 SIDES = ((0, 1), (1, 2), (2, 0))
-
-
-@dataclass
-class Outline:
-    """The curve on which a surface ends, near a line of sight. Detached."""
-
-    m: Hit  # the material point on it: a hit at distance 0
-    n: mi.Vector3f  # unit, across curve and line of sight
-    gap: mi.Float  # distance of the line of sight, signed by n [m]; infinite: there is no curve
 
 
 @dataclass
@@ -157,20 +150,10 @@ def triangle(hit: Hit, active: mi.Bool) -> tuple[mi.Bool, list[mi.Point3f]]:
     return on_mesh, [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
 
 
-def _resting(hit: Hit, m: mi.Point3f, prim_uv: mi.Point2f) -> Hit:
-    """The point `m` of the surface that `hit` meets, as a hit at distance 0."""
-    nothing = dr.zeros(mi.Float, dr.width(hit.t))
-    return Hit(mi.Point3f(m), mi.Vector3f(hit.d), nothing, hit.shape, hit.prim_index, mi.Point2f(prim_uv))
-
-
-def _closer(a: Outline, b: Outline) -> Outline:
-    return dr.select(dr.abs(b.gap) < dr.abs(a.gap), b, a)
-
-
 def edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
     """The side of the triangle at the end of `hit`, which it meets at `p`, that `line` passes closest by."""
     on_mesh, x = triangle(hit, mi.Bool(True))
-    best = Outline(_resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
+    best = Outline(resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
     for i, j in SIDES:
         along = x[j] - x[i]
         n = dr.cross(along, line.d)
@@ -179,7 +162,7 @@ def edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
         s = dr.clip(dr.dot(p - x[i], along) / dr.squared_norm(along), 0, 1)
         uv = dr.lerp(mi.Point2f(CORNERS[i]), mi.Point2f(CORNERS[j]), s)
         gap = dr.select(on_mesh & (length > 0), dr.dot(n, line.o - x[i]), dr.inf)
-        best = _closer(best, Outline(_resting(hit, x[i] + s * along, uv), n, gap))
+        best = best.or_closer(Outline(resting(hit, x[i] + s * along, uv), n, gap))
     return best
 
 
@@ -193,31 +176,33 @@ def _analytic_outline(shapes: AnalyticShapes, hit: Hit, p: mi.Point3f, line: mi.
     m = transform_point(columns, contact)
     n = dr.normalize(transform_vector(columns, radial))
     gap = dr.select(shape.there & ~shape.disk, dr.dot(n, line.o - m), dr.inf)
-    contour = Outline(_resting(hit, m, mi.Point2f(0)), n, gap)
+    outline = Outline(resting(hit, m, mi.Point2f(0)), n, gap)
 
     rim = dr.normalize(mi.Vector3f(q.x, q.y, 0))
     height = dr.select(shape.disk | (q.z < 0.5), mi.Float(0), 1)
     m = transform_point(columns, mi.Point3f(rim.x, rim.y, height))
     n = dr.normalize(dr.cross(transform_vector(columns, mi.Vector3f(-rim.y, rim.x, 0)), line.d))
     gap = dr.select(shape.there & ~shape.sphere, dr.dot(n, line.o - m), dr.inf)
-    return _closer(contour, Outline(_resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap))
+    return outline.or_closer(Outline(resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap))
 
 
-def _outline(shapes: AnalyticShapes | None, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
-    edge = edge_outline(hit, p, line)
-    return edge if shapes is None else _closer(edge, _analytic_outline(shapes, hit, p, line))
+def _outline(world: ChainWorld, shapes: AnalyticShapes | None, hit: Hit, si, line: mi.Ray3f) -> Outline:
+    best = edge_outline(hit, si.p, line)
+    if world.has_contours:
+        best = best.or_closer(contour(world.tables, hit, si, line))
+    return best if shapes is None else best.or_closer(_analytic_outline(shapes, hit, si.p, line))
 
 
-def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None, pair: Pair, sight: Hit) -> Curve:
+def crossed_curve(world: ChainWorld, shapes: AnalyticShapes | None, pair: Pair, sight: Hit) -> Curve:
     """The curve between the two chains, for the line of sight of the first: its segment `sight`."""
     line = mi.Ray3f(sight.o, sight.d)
     first = pair.a.intersection().t <= pair.b.intersection().t
     near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
     near, far = (dr.select(pair.horizon, sight, hit) for hit in (near, far))
-    si_near, si_far = near.interaction(), far.interaction()
-    best = _outline(shapes, near, si_near.p, line)
+    si_near, si_far = surface_of(world.tables, near), surface_of(world.tables, far)
+    best = _outline(world, shapes, near, si_near, line)
     touching = (far.shape != 0) & (far.t - near.t < TOUCHING * far.t)
-    other = _outline(shapes, far, si_far.p, line)
+    other = _outline(world, shapes, far, si_far, line)
     closer = touching & (FARTHER * dr.abs(other.gap) < dr.abs(best.gap))
     best = dr.select(closer, other, best)
 
@@ -235,9 +220,10 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
     n = mi.Vector3f(c1 + c2) * scale
     in_front = dr.dot(si_near.n, n) / dr.dot(si_near.n, line.d) > dr.dot(si_far.n, n) / dr.dot(si_far.n, line.d)
     pattern, g, side = mi.Bool(False), mi.Vector2f(0), dr.select(first ^ in_front, mi.Float(-1), 1)
-    if patterns is not None:
+    if world.patterns is not None:
         pattern = pair.family != NO_FAMILY
-        g, F_line, side_line = patterns.line(pair.family, pair.a.interaction(), pair.b.interaction())
+        ends = surface_of(world.tables, pair.a), surface_of(world.tables, pair.b)
+        g, F_line, side_line = world.patterns.line(pair.family, *ends)
         F, shading, side = dr.select(pattern, F_line, F), shading & ~pattern, dr.select(pattern, side_line, side)
     horizon = pair.horizon & pair.one_face
     F = dr.select(horizon, dr.dot(si_near.n, pair.a.d), F)
@@ -250,8 +236,8 @@ def crossed_curve(shapes: AnalyticShapes | None, patterns: ChainPatterns | None,
         g=g,
         cut=cut & ~pattern & ~shading,
         side=side,
-        m1=dr.select(cut, _resting(near, si_near.p, near.prim_uv), best.m),
-        m2=dr.select(cut, _resting(far, si_far.p, far.prim_uv), best.m),
+        m1=dr.select(cut, resting(near, si_near.p, near.prim_uv), best.m),
+        m2=dr.select(cut, resting(far, si_far.p, far.prim_uv), best.m),
         c1=dr.select(cut, mi.Vector3f(c1 * scale), best.n),
         c2=dr.select(cut, mi.Vector3f(c2 * scale), 0),
         t=dr.select(cut, t, dr.dot(best.m.o - line.o, line.d)),

@@ -21,6 +21,7 @@ from ..core.records import Hit
 from ..paths.delta_step import delta_step
 from ..plan.motion import Displacements, Motion, SceneDisplacements
 from ..scene.facts import SceneFacts
+from ..scene.surfaces import Surfaces
 from .chain_trace import ChainRecords
 
 
@@ -29,13 +30,14 @@ class AtRest(Motion):
     """Nothing moves but what is asked about."""
 
     sensor: mi.Sensor
+    surfaces: Surfaces | None
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:
         with dr.resume_grad():
             dr.enable_grad(*variables)
         with dr.resume_grad(*variables):
-            yield SceneDisplacements(self.sensor, None)  # curves are refused beside delta lobes
+            yield SceneDisplacements(self.sensor, self.surfaces)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
         return mi.Vector3f(0), mi.Vector3f(0)

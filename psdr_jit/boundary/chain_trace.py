@@ -20,14 +20,19 @@ import mitsuba as mi
 from ..core.records import Hit
 from ..core.varying import varying
 from ..edges.followed_lights import FollowedLights, followed_lights
+from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from ..scene.registry import registry_table
+from ..scene.surfaces import Surfaces
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps
 from .chain_lobes import Leaving, LobeNumber, has_delta, leave, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_surface import NOWHERE, ChainSurfaces, goes_under
+
+#: Kinds of shapes that have neither triangles nor a pose.
+ROUNDED = ("curve", "grid", "ellipsoids")
 
 #: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
 CHAIN_DEPTH = 8
@@ -38,6 +43,7 @@ class ChainWorld:
     """What chains are traced in. Host object."""
 
     scene: mi.Scene
+    tables: Surfaces | None  # what Mitsuba does not evaluate of it
     depth: int  # largest number of segments
     surfaces: ChainSurfaces
     patterns: ChainPatterns | None  # None: no surface steps inside
@@ -49,6 +55,7 @@ class ChainWorld:
     mode: mi.TransportMode  # of what is carried from there: radiance, or importance
     followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
     lamps: ChainLamps | None = None  # that may hide between two chains
+    has_contours: bool = False  # are there bodies whose ends `chain_contour` knows?
     aims: ChainAims | None = None  # what directions from smooth vertices are aimed at
 
     @staticmethod
@@ -59,6 +66,7 @@ class ChainWorld:
         depth = min(job.limits.max_depth, CHAIN_DEPTH)
         return ChainWorld(
             scene=job.scene,
+            tables=job.surfaces,
             depth=depth,
             surfaces=ChainSurfaces.of(job),
             patterns=ChainPatterns.of(job),
@@ -70,6 +78,7 @@ class ChainWorld:
             mode=mi.TransportMode.Radiance,
             followed=followed_lights(job),
             lamps=ChainLamps.of(job),
+            has_contours=any(s.kind in ROUNDED for s in facts.shapes),
         )
 
     def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
@@ -173,7 +182,8 @@ def guide(world: ChainWorld, ray: mi.Ray3f, numbers: tuple, sampler, line: mi.UI
     rng, lobe = numbers[0], LobeNumber.begin(numbers[1])
     ctx = mi.BSDFContext(world.mode)
     while dr.hint(k < world.depth, label="psdr.chain.guide", exclude=[world, out, ctx]):
-        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        pi = world.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        si = surface_at(world.tables, pi, ray, mi.RayFlags.All, active)
         active &= si.is_valid()
         u = Numbers.draw(rng)
         smooth, _ = smooth_choice(si.bsdf(), k, u.lobe.x)
@@ -202,8 +212,8 @@ def trace_pair(
     while dr.hint(active, label="psdr.chain.pair", exclude=[world, directions, store, ctx]):
         pi_a = world.scene.ray_intersect_preliminary(ray_a, coherent=False, active=active)
         pi_b = world.scene.ray_intersect_preliminary(ray_b, coherent=False, active=active)
-        a = pi_a.compute_surface_interaction(ray_a, mi.RayFlags.All)
-        b = pi_b.compute_surface_interaction(ray_b, mi.RayFlags.All)
+        a = surface_at(world.tables, pi_a, ray_a, mi.RayFlags.All)
+        b = surface_at(world.tables, pi_b, ray_b, mi.RayFlags.All)
         pair.a, pair.b = Hit.of(ray_a, pi_a), Hit.of(ray_b, pi_b)
         if dr.hint(store is not None, mode="scalar"):
             store.write(pair.k, pair.a, active)

@@ -26,7 +26,9 @@ from ..core.surface_code import surface_code
 from ..core.varying import varying
 from ..paths.delta_step import delta_step
 from ..paths.orbits import Orbits
+from ..paths.surface_at import surface_at
 from ..plan.motion import Displacements
+from ..scene.surfaces import Surfaces
 
 
 @dataclass
@@ -101,6 +103,7 @@ def carried_along(
 
 
 def through_vertex(
+    surfaces: Surfaces | None,
     pi: mi.PreliminaryIntersection3f,
     si: mi.SurfaceInteraction3f,
     bsdf: mi.BSDFPtr,
@@ -127,7 +130,7 @@ def through_vertex(
         near = mi.PreliminaryIntersection3f(pi)
         near.t = lead(si.p)
         ray = mi.Ray3f(si.p - near.t * ω_in + û, ω_in)
-        there = near.compute_surface_interaction(ray, mi.RayFlags.All, delta)
+        there = surface_at(surfaces, near, ray, mi.RayFlags.All, delta)
         accumulate(dr.select(delta, dr.dot(b_n, there.sh_frame.n), 0))  # flat faces do not bend
         bent = mi.Vector3f(dr.grad(û))
     return dr.select(delta, b_in, 0), dr.select(delta, bent, 0)

@@ -43,6 +43,7 @@ from ..core.sensor_frame import lens_point
 from ..core.streams import Stream, stream_seed
 from ..paths.bounce import particle_eval
 from ..paths.light_walk import take_up
+from ..paths.surface_at import surface_at, surface_of
 from ..plan.job import Job, passes
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
@@ -155,7 +156,7 @@ def _connected(job: Job, pair: Pair, hit: Hit, Φβ: mi.Spectrum, wavelengths):
     """The end of `hit`, where paths part in what the sensor sees: `(view, lens point, g if it is seen)`."""
     active = pair.in_light | pair.turned
     ray = mi.Ray3f(hit.o, hit.d, 0, wavelengths)
-    si = hit.intersection().compute_surface_interaction(ray, mi.RayFlags.All, active)
+    si = surface_at(job.surfaces, hit.intersection(), ray, mi.RayFlags.All, active)
     view, aperture = sensor_view(job.frame, si.p, pair.light.u)
     f = particle_eval(si, si.bsdf(), -view.ω, active)
     return view, aperture, dr.select(active, Φβ * f / view.J_px, 0)
@@ -173,7 +174,7 @@ def _steps(lines: LightLines | None) -> LightSteps | None:
     wavelengths, weight = job.sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), line.wavelength)
     Φ = _intensity(line, line.direction(p), wavelengths) * weight
     ends = pair.a, pair.b
-    pair = beside_curve(job.scene, lines.world.patterns, pair, curve)
+    pair = beside_curve(lines.world, pair, curve)
     shared = chain.segment(pair.k, pair.in_light)
     connected = [
         _connected(job, pair, dr.select(pair.in_light, shared, hit), Φ * β, wavelengths)
@@ -206,7 +207,7 @@ def _end(job: Job, pair: Pair, curve: Curve, view, aperture: mi.Point2f) -> Ligh
     if frame.kind != "orthographic":
         lens = frame.to_world @ lens_point(frame, aperture)
         distance = dr.norm(lens - curve.line.o)
-    si = curve.line.interaction(pair.turned)
+    si = surface_of(job.surfaces, curve.line, pair.turned)
     cos = dr.dot(si.sh_frame.n, view.ω)
     curve = replace(
         curve,

@@ -277,7 +277,7 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
         found = job.scene.ray_intersect_preliminary(following, coherent=False, active=goes_on)
         if dr.hint(records.delta is not None, mode="scalar"):
             delta = onward.alive & onward.scattering.delta
-            turned, bent = through_vertex(pi, si, bsdf, b, -following.d, -ray.d, delta)
+            turned, bent = through_vertex(job.surfaces, pi, si, bsdf, b, -following.d, -ray.d, delta)
             through = dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.sh_frame.n, following.d) > 0
             a += bent
             arriving = turned + found.t * a

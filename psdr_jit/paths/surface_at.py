@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.curve_frame import turns
+from ..core.records import Hit
 from ..core.tube_axis import Axis
 from ..scene.surfaces import Splines, Surfaces
 from .cylinder_surface import cylinder_surface
@@ -57,6 +58,13 @@ def surface_at(
             setattr(si, name, dr.select(on_curve, getattr(own, name), getattr(si, name)))
     si.wavelengths = ray.wavelengths
     return si
+
+
+def surface_of(
+    surfaces: Surfaces | None, hit: Hit, active: mi.Bool | bool = True, flags=mi.RayFlags.All
+) -> mi.SurfaceInteraction3f:
+    """The surface at the end of `hit`. Detached, unless `flags` follow the shape."""
+    return surface_at(surfaces, hit.intersection(), mi.Ray3f(hit.o, hit.d), flags, active)
 
 
 def _spline_surface(

@@ -155,7 +155,7 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
     """Directions follow delta lobes; what cannot be followed is refused, what is not sampled behind them is named."""
     if not facts.geometry_moves:
         return
-    beside = next((s.name for s in facts.shapes if s.kind in ("instance", "curve", "grid", "ellipsoids")), "")
+    beside = next((s.name for s in facts.shapes if s.kind in ("instance",)), "")
     for shape in facts.shapes:
         if not shape.delta_lobes:
             continue

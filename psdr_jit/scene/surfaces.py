@@ -88,6 +88,14 @@ class Splines(Segments):
         """The axis at v of segments, attached as their control points are."""
         return Axis.of(self.control_points(segment, 4, active), v)
 
+    def ends(self, segment: mi.UInt32, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Does a curve begin with these segments, does it end with them? Of one, control points follow each other."""
+        last = dr.width(self.first) - 1
+        own = dr.gather(mi.UInt32, self.first, segment, active)
+        before = dr.gather(mi.UInt32, self.first, dr.maximum(segment, 1) - 1, active)
+        after = dr.gather(mi.UInt32, self.first, dr.minimum(segment + 1, last), active)
+        return active & ((segment == 0) | (before + 1 != own)), active & ((segment == last) | (own + 1 != after))
+
 
 class Rods(Segments):
     """Linear curves."""

@@ -81,4 +81,4 @@ def test_guesses_are_where_halving_ends(name, llvm):
 def _guesses(scene: mi.Scene) -> Guesses:
     shapes = [SimpleNamespace(index=i, plugin=s.class_name().lower()) for i, s in enumerate(scene.shapes())]
     job = SimpleNamespace(scene=scene, facts=SimpleNamespace(shapes=shapes))
-    return Guesses(AnalyticShapes.of(job), smooth=False)
+    return Guesses(AnalyticShapes.of(job), None, smooth=False)

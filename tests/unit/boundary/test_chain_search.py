@@ -29,7 +29,7 @@ class Striped:
     def __init__(self, start: np.ndarray, width: float, lamp: bool, awkward: bool):
         self.count, self.start, self.width = len(start), mi.Float(start.astype(np.float32)), width
         self.lamp, self.awkward = lamp, awkward
-        self.job = SimpleNamespace(seed=7, facts=SimpleNamespace(shapes=()))
+        self.job = SimpleNamespace(seed=7, surfaces=None, facts=SimpleNamespace(shapes=()))
 
     least_width = property(lambda self: mi.Float(2.0**-12))
 

@@ -74,7 +74,7 @@ def carried_back(scene: mi.Scene, at: tuple[np.ndarray, np.ndarray]) -> float:
             with motion.attached() as moving:
                 summand = records.motion(hit, moving) + dr.dot(on_surface, moving.of_surface(hit))
                 total += tangents(summand)[0]
-            turned, bent = through_vertex(pi, si, si.bsdf(), b, -following.d, -ray.d, mi.Bool(True))
+            turned, bent = through_vertex(None, pi, si, si.bsdf(), b, -following.d, -ray.d, mi.Bool(True))
             a, ray = a - on_surface + bent, following
             pi = scene.ray_intersect_preliminary(ray)
             b = turned + pi.t * a
