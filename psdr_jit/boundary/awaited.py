@@ -35,7 +35,7 @@ class Awaited:
         return Awaited(movers, registry_table(job.scene, {s.index for s in job.facts.shapes if s.moves}))
 
     def met(self, shape: mi.UInt32) -> mi.Bool:
-        return dr.gather(mi.UInt32, self.moving, shape, shape != 0) != 0
+        return dr.gather(mi.UInt32, self.moving, shape, (shape != 0) & (shape < dr.width(self.moving))) != 0
 
     def aimed(self, limits: PathLimits, x: mi.Point3f, waits: mi.Bool) -> PathLimits:
         """The limits with an aim from `x`, for those that wait."""

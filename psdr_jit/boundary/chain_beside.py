@@ -14,10 +14,14 @@ import mitsuba as mi
 
 from ..core.records import Hit
 from ..edges.points import LEAST_SLANT, clear_of_lift
+from ..paths.rays import ROUNDING
 from ..paths.surface_at import surface_of
 from .chain_outline import Curve, edge_outline, triangle
 from .chain_patterns import INSET
 from .chain_trace import ChainWorld, Pair
+
+#: How far inside of an edge its face is looked at, in units of rounding.
+INSIDE = 4.0
 
 #: How far from an edge, as a share of its distance from the face's centroid, the other face is looked for, ...
 PROBE = 0.1
@@ -33,7 +37,9 @@ def beside_curve(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     """The last segments clear of a crossed line of a pattern, of a cut, or of a sharp edge; others as they are."""
     if world.patterns is not None:
         pair = _beside_line(world, pair, curve)
-    pair = _beside_sharp_edges(world.scene, _beside_cut(world, pair, curve))
+    pair = _beside_sharp_edges(world, _beside_cut(world, _inside_edge(world, pair, curve), curve))
+    if world.has_contours:
+        pair = _inside_contour(pair, curve)
     dr.eval(pair)  # in one kernel: what follows is asked for one by one
     return pair
 
@@ -62,22 +68,60 @@ def _beside_cut(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     return _both_moved(world.scene, pair, curve.side * n * (clear_of_lift(x) * (1 + cot)), crossed)
 
 
-def _beside_sharp_edges(scene: mi.Scene, pair: Pair) -> Pair:
+def _on_curve(pair: Pair, curve: Curve) -> tuple[mi.Bool, mi.Bool]:
+    """Is it the first segment, or the second, that ends on the crossed curve? Of two on one shape it is the nearer."""
+    a_on, b_on = pair.a.shape == curve.m1.shape, pair.b.shape == curve.m1.shape
+    first = a_on & (~b_on | (pair.a.t <= pair.b.t))
+    return first & ~pair.in_light, b_on & ~first & ~pair.in_light
+
+
+def _inside_edge(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
+    """Of a mesh's edge: the segment that ends at it, moved inside of its face by more than rounding.
+
+    Lines are halved until what they meet is as close to the edge as a hit is known: of an outline it may be the face
+    behind, met from its back.
+    """
+    edge = curve.valid & ~(curve.cut | curve.pattern | curve.shading | curve.horizon)
+
+    def moved(hit: Hit, active: mi.Bool) -> Hit:
+        on_mesh, corners = triangle(world.surfaces.copies, hit, active & edge)
+        inward = dr.sign(dr.dot((corners[0] + corners[1] + corners[2]) / 3 - curve.m1.o, curve.c1)) * curve.c1
+        step = INSIDE * ROUNDING * (1 + dr.max(dr.abs(curve.m1.o)))
+        return _moved(world.scene, hit, step * inward, on_mesh)
+
+    first, second = _on_curve(pair, curve)
+    return replace(pair, a=moved(pair.a, first), b=moved(pair.b, second))
+
+
+def _inside_contour(pair: Pair, curve: Curve) -> Pair:
+    """Where rays meet a surface next to its contour with any normal: the segment that ends on it, a little inside of
+    it; no ray is traced.
+    """
+    inside, x = dr.any(curve.inside != 0), curve.m1.o + curve.inside
+
+    def moved(hit: Hit, active: mi.Bool) -> Hit:
+        return dr.select(active, replace(curve.m1, o=mi.Point3f(x - hit.t * hit.d), d=hit.d, t=hit.t), hit)
+
+    first, second = _on_curve(pair, curve)
+    return replace(pair, a=moved(pair.a, inside & first), b=moved(pair.b, inside & second))
+
+
+def _beside_sharp_edges(world: ChainWorld, pair: Pair) -> Pair:
     """Of a mesh's edge sharper than a right angle: last segments moved along their faces until rays start inside.
 
     A ray that starts a height h off a face, at less than h cot φ from an edge where another face meets it at the angle
     φ, starts behind that one (`edges.points.face_inset`).
     """
     active = ~pair.in_light
-    return replace(pair, a=_clear_of_edge(scene, pair.a, active), b=_clear_of_edge(scene, pair.b, active))
+    return replace(pair, a=_clear_of_edge(world, pair.a, active), b=_clear_of_edge(world, pair.b, active))
 
 
-def _clear_of_edge(scene: mi.Scene, hit: Hit, active: mi.Bool) -> Hit:
+def _clear_of_edge(world: ChainWorld, hit: Hit, active: mi.Bool) -> Hit:
     """The segment, moved in parallel into the triangle that it ends on, if it ends too near to a sharp edge of that."""
     line = mi.Ray3f(hit.o, hit.d)
-    on_mesh, corners = triangle(hit, active)
+    on_mesh, corners = triangle(world.surfaces.copies, hit, active)
     p = line(dr.select(on_mesh, hit.t, 0))
-    edge = edge_outline(hit, p, line)
+    edge = edge_outline(world.surfaces.copies, hit, p, line)
     m = edge.m.o
     n_face = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
     inward = mi.Vector3f((corners[0] + corners[1] + corners[2]) / 3 - m)
@@ -85,11 +129,11 @@ def _clear_of_edge(scene: mi.Scene, hit: Hit, active: mi.Bool) -> Hit:
     inward -= τ * dr.dot(τ, inward)
     depth = dr.norm(inward)
     inward /= depth
-    cot = dr.maximum(*(_cot_to_other(scene, m, (inward, τ, side * n_face), depth, on_mesh) for side in (-1, 1)))
+    cot = dr.maximum(*(_cot_to_other(world.scene, m, (inward, τ, side * n_face), depth, on_mesh) for side in (-1, 1)))
     needed = clear_of_lift(m) * cot
     slant = dr.dot(inward, edge.n)
     near = on_mesh & (dr.abs(edge.gap) < needed * dr.abs(slant)) & (needed < depth)
-    return _moved(scene, hit, edge.n * (needed * slant), near)
+    return _moved(world.scene, hit, edge.n * (needed * slant), near)
 
 
 def _cot_to_other(scene: mi.Scene, m: mi.Point3f, frame: tuple, depth: mi.Float, active: mi.Bool) -> mi.Float:

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
+from ..edges.copy_table import CopyTable
 from ..paths.surface_at import surface_of
 from ..scene.surfaces import Surfaces
 from .chain_outline import SIDES, AnalyticShapes, triangle
@@ -70,6 +71,7 @@ class Guesses:
     """What is asked of where chains part. Host object."""
 
     analytic: AnalyticShapes | None
+    copies: CopyTable | None  # of what instances show
     tables: Surfaces | None  # what Mitsuba does not evaluate
     smooth: bool  # are there surfaces with shading normals?
 
@@ -79,7 +81,7 @@ class Guesses:
         outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon & ~pair.turned
         first = pair.a.intersection().t <= pair.b.intersection().t
         near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
-        of_near, of_far = (triangle(hit, outlined) for hit in (near, far))
+        of_near, of_far = (triangle(self.copies, hit, outlined) for hit in (near, far))
         s = _past_sides(*of_near, near, far)
         t = _past_sides(*of_far, far, near)
         if self.analytic is not None:

@@ -24,16 +24,19 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
+from ..edges.copy_table import CopyTable, code_of, number_of, values_of_shapes
 from ..edges.curves import CURVES_OF, local_viewpoint, transform_point, transform_vector
+from ..edges.edge_shapes import edge_shapes
 from ..paths.delta_step import delta_step
+from ..paths.rays import ROUNDING
 from ..paths.surface_at import surface_of
 from ..plan.job import Job
 from ..plan.motion import Displacements
 from ..scene.facts import SceneFacts
 from ..scene.poses import Poses
-from ..scene.registry import registry_values
 from .chain_contour import Outline, contour, resting
 from .chain_patterns import NO_FAMILY
+from .chain_surface import ONE_SHADING
 from .chain_trace import ChainWorld, Pair
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
@@ -42,8 +45,8 @@ TOUCHING = 1e-3
 #: How much closer the edge of the farther surface, and a cut, must be passed by to be preferred.
 FARTHER, CUT = 2.0, 4.0
 
-#: Difference of shading normals below which two faces of a mesh that touch share an edge: they do not cut there.
-ONE_SHADING = 1e-2
+#: How much closer, in units of rounding, a cut must be passed by at the least.
+SURE = 4.0
 
 #: Corners of a triangle in barycentric coordinates of its hits.
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
@@ -68,6 +71,7 @@ class Curve:
     m2: Hit
     c1: mi.Vector3f
     c2: mi.Vector3f
+    inside: mi.Vector3f  # from m_1 to where the surface that ends there is looked at; 0: where it has been met
     t: mi.Float
     F: mi.Float  # where the chain was traced [m]
     valid: mi.Bool
@@ -116,44 +120,47 @@ class AnalyticShape:
 class AnalyticShapes:
     """Spheres, disks and cylinders of a scene. Host object."""
 
-    number: mi.UInt32  # by registry index of a shape: 1 + its place below, 0: it is none of these
+    copies: CopyTable | None
+    number: mi.UInt32  # by registry index of a shape or a copy: 1 + its place below, 0: it is none of these
     columns: tuple[mi.Vector3f, ...]  # of their object-to-world maps
     kind: mi.UInt32
 
     @staticmethod
     def of(job: Job) -> AnalyticShapes | None:
-        chosen = [s for s in job.facts.shapes if s.index >= 0 and s.plugin in CURVES_OF]
+        chosen = [s for s in edge_shapes(job).facts if s.plugin in CURVES_OF]
         if not chosen:
             return None
-        shapes = tuple(job.scene.shapes()[s.index] for s in chosen)
-        number = registry_values(job.scene, {s.index: i + 1 for i, s in enumerate(chosen)})
+        shapes = tuple(edge_shapes(job).shapes[s.index] for s in chosen)
+        number = values_of_shapes(job, {s.index: i + 1 for i, s in enumerate(chosen)})
         columns = Poses.of(shapes).columns
         kind = mi.UInt32([list(CURVES_OF).index(s.plugin) for s in chosen])
         dr.eval(number, columns, kind)
-        return AnalyticShapes(number, columns, kind)
+        return AnalyticShapes(CopyTable.of(job), number, columns, kind)
 
     def met_by(self, hit: Hit, active: mi.Bool) -> AnalyticShape:
         """The shape at the end of `hit`."""
-        number = dr.gather(mi.UInt32, self.number, hit.shape, active & (hit.shape != 0))
+        number = dr.gather(mi.UInt32, self.number, code_of(self.copies, hit.shape), active & (hit.shape != 0))
         i = dr.maximum(number, 1) - 1
         columns = tuple(dr.gather(mi.Vector3f, c, i) for c in self.columns)
         kind = dr.gather(mi.UInt32, self.kind, i)
         return AnalyticShape(number != 0, columns, *(kind == list(CURVES_OF).index(s) for s in ("sphere", "disk")))
 
 
-def triangle(hit: Hit, active: mi.Bool) -> tuple[mi.Bool, list[mi.Point3f]]:
+def triangle(copies: CopyTable | None, hit: Hit, active: mi.Bool) -> tuple[mi.Bool, list[mi.Point3f]]:
     """`(is there one, its corners)`: the triangle at the end of `hit`. Detached."""
-    on_mesh = active & (hit.shape != 0)
-    on_mesh &= dr.reinterpret_array(mi.ShapePtr, dr.select(on_mesh, hit.shape, 0)).is_mesh()
-    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, hit.shape, 0))
+    shape = code_of(copies, dr.select(active, hit.shape, 0))
+    on_mesh = active & (shape != 0)
+    on_mesh &= dr.reinterpret_array(mi.ShapePtr, dr.select(on_mesh, shape, 0)).is_mesh()
+    mesh = dr.reinterpret_array(mi.MeshPtr, dr.select(on_mesh, shape, 0))
     corners = mesh.face_indices(hit.prim_index, on_mesh)
     return on_mesh, [dr.detach(mesh.vertex_position(corners[i], on_mesh)) for i in range(3)]
 
 
-def edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
+def edge_outline(copies: CopyTable | None, hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
     """The side of the triangle at the end of `hit`, which it meets at `p`, that `line` passes closest by."""
-    on_mesh, x = triangle(hit, mi.Bool(True))
-    best = Outline(resting(hit, p, hit.prim_uv), mi.Vector3f(0), dr.full(mi.Float, dr.inf, dr.width(hit.t)))
+    on_mesh, x = triangle(copies, hit, mi.Bool(True))
+    none = dr.full(mi.Float, dr.inf, dr.width(hit.t))
+    best = Outline(resting(hit, p, hit.prim_uv), mi.Vector3f(0), none, mi.Vector3f(0))
     for i, j in SIDES:
         along = x[j] - x[i]
         n = dr.cross(along, line.d)
@@ -162,7 +169,7 @@ def edge_outline(hit: Hit, p: mi.Point3f, line: mi.Ray3f) -> Outline:
         s = dr.clip(dr.dot(p - x[i], along) / dr.squared_norm(along), 0, 1)
         uv = dr.lerp(mi.Point2f(CORNERS[i]), mi.Point2f(CORNERS[j]), s)
         gap = dr.select(on_mesh & (length > 0), dr.dot(n, line.o - x[i]), dr.inf)
-        best = best.or_closer(Outline(resting(hit, x[i] + s * along, uv), n, gap))
+        best = best.or_closer(Outline(resting(hit, x[i] + s * along, uv), n, gap, mi.Vector3f(0)))
     return best
 
 
@@ -176,20 +183,22 @@ def _analytic_outline(shapes: AnalyticShapes, hit: Hit, p: mi.Point3f, line: mi.
     m = transform_point(columns, contact)
     n = dr.normalize(transform_vector(columns, radial))
     gap = dr.select(shape.there & ~shape.disk, dr.dot(n, line.o - m), dr.inf)
-    outline = Outline(resting(hit, m, mi.Point2f(0)), n, gap)
+    outline = Outline(resting(hit, m, mi.Point2f(0)), n, gap, mi.Vector3f(0))
 
     rim = dr.normalize(mi.Vector3f(q.x, q.y, 0))
     height = dr.select(shape.disk | (q.z < 0.5), mi.Float(0), 1)
     m = transform_point(columns, mi.Point3f(rim.x, rim.y, height))
     n = dr.normalize(dr.cross(transform_vector(columns, mi.Vector3f(-rim.y, rim.x, 0)), line.d))
     gap = dr.select(shape.there & ~shape.sphere, dr.dot(n, line.o - m), dr.inf)
-    return outline.or_closer(Outline(resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap))
+    return outline.or_closer(Outline(resting(hit, m, mi.Point2f(rim.x, rim.y)), n, gap, mi.Vector3f(0)))
 
 
-def _outline(world: ChainWorld, shapes: AnalyticShapes | None, hit: Hit, si, line: mi.Ray3f) -> Outline:
-    best = edge_outline(hit, si.p, line)
+def _outline(world: ChainWorld, shapes: AnalyticShapes | None, at: tuple, line: mi.Ray3f, bends: mi.Bool) -> Outline:
+    """`at`: hit and surface interaction; `bends`: the surface goes on, and bends there."""
+    hit, si = at
+    best = edge_outline(world.surfaces.copies, hit, si.p, line)
     if world.has_contours:
-        best = best.or_closer(contour(world.tables, hit, si, line))
+        best = best.or_closer(contour(world, hit, si, line, bends))
     return best if shapes is None else best.or_closer(_analytic_outline(shapes, hit, si.p, line))
 
 
@@ -200,9 +209,13 @@ def crossed_curve(world: ChainWorld, shapes: AnalyticShapes | None, pair: Pair, 
     near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
     near, far = (dr.select(pair.horizon, sight, hit) for hit in (near, far))
     si_near, si_far = surface_of(world.tables, near), surface_of(world.tables, far)
-    best = _outline(world, shapes, near, si_near, line)
     touching = (far.shape != 0) & (far.t - near.t < TOUCHING * far.t)
-    other = _outline(world, shapes, far, si_far, line)
+    folded = (near.shape == far.shape) & (dr.norm(si_near.sh_frame.n - si_far.sh_frame.n) < ONE_SHADING)
+    if world.surfaces.grids is not None:
+        folded &= ~world.surfaces.grids.bends(number_of(world.surfaces.copies, si_near), si_near.n, si_far.n)
+    bends = touching & (near.shape == far.shape) & ~folded
+    best = _outline(world, shapes, (near, si_near), line, bends)
+    other = _outline(world, shapes, (far, si_far), line, bends)
     closer = touching & (FARTHER * dr.abs(other.gap) < dr.abs(best.gap))
     best = dr.select(closer, other, best)
 
@@ -211,8 +224,8 @@ def crossed_curve(world: ChainWorld, shapes: AnalyticShapes | None, pair: Pair, 
     t = dr.dot(si_near.p - line.o, line.d)
     x = line.o + t * line.d
     F_cut = (dr.dot(c1, x - si_near.p) + dr.dot(c2, x - si_far.p)) * scale
-    folded = (near.shape == far.shape) & (dr.norm(si_near.sh_frame.n - si_far.sh_frame.n) < ONE_SHADING)
-    cut = touching & ~folded & dr.isfinite(scale) & (CUT * dr.abs(F_cut) < dr.abs(best.gap))
+    known = SURE * ROUNDING * (1 + dr.max(dr.abs(x)))  # where two faces share an edge, that is the curve
+    cut = touching & ~folded & dr.isfinite(scale) & (CUT * dr.abs(F_cut) + known < dr.abs(best.gap))
 
     h_near, h_far = dr.dot(si_near.sh_frame.n, line.d), dr.dot(si_far.sh_frame.n, line.d)
     shading = touching & (near.shape == far.shape) & (h_near * h_far <= 0)
@@ -225,6 +238,10 @@ def crossed_curve(world: ChainWorld, shapes: AnalyticShapes | None, pair: Pair, 
         ends = surface_of(world.tables, pair.a), surface_of(world.tables, pair.b)
         g, F_line, side_line = world.patterns.line(pair.family, *ends)
         F, shading, side = dr.select(pattern, F_line, F), shading & ~pattern, dr.select(pattern, side_line, side)
+    if world.surfaces.grids is not None:
+        si_a, si_b = (dr.select(first, one, other) for one, other in ((si_near, si_far), (si_far, si_near)))
+        bent = world.surfaces.grids.side(number_of(world.surfaces.copies, si_a), si_a, si_b, line.d, n)
+        side = dr.select(bends & (bent != 0), bent, side)
     horizon = pair.horizon & pair.one_face
     F = dr.select(horizon, dr.dot(si_near.n, pair.a.d), F)
     return Curve(
@@ -240,6 +257,7 @@ def crossed_curve(world: ChainWorld, shapes: AnalyticShapes | None, pair: Pair, 
         m2=dr.select(cut, resting(far, si_far.p, far.prim_uv), best.m),
         c1=dr.select(cut, mi.Vector3f(c1 * scale), best.n),
         c2=dr.select(cut, mi.Vector3f(c2 * scale), 0),
+        inside=dr.select(cut | shading | pattern | horizon, 0, best.inside),
         t=dr.select(cut, t, dr.dot(best.m.o - line.o, line.d)),
         F=F,
         valid=dr.isfinite(F),

@@ -17,12 +17,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.upload import uploaded
+from ..edges.copy_table import CopyTable, number_of, values_of_shapes
+from ..edges.edge_shapes import edge_shapes
 from ..edges.scene_patterns import steps_of
 from ..edges.seams import charts
 from ..edges.segments import known_topology
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
-from ..scene.registry import registry_values
 
 #: Number of no family.
 NO_FAMILY = 0
@@ -51,6 +52,7 @@ class Family:
 class ChainPatterns:
     """All families of a scene. Host object."""
 
+    copies: CopyTable | None  # of what instances show: shapes as the tables below know them
     families: Family  # number 0 has no lines
     start: mi.UInt32  # by registry index of a shape: number of its first family
     count: mi.UInt32  # and how many it has
@@ -62,7 +64,7 @@ class ChainPatterns:
     @staticmethod
     def of(job: Job) -> ChainPatterns | None:
         """None if nothing steps."""
-        shapes = [s for s in job.facts.shapes if s.index >= 0]
+        shapes = list(edge_shapes(job).facts)
         found = [steps_of(job, s) if s.patterns else ([], False) for s in shapes]
         parts = [
             np.arange(s.faces) if between_faces else _charts(job, s)
@@ -84,18 +86,18 @@ class ChainPatterns:
         families = Family(mi.Vector2f(a0, a1), b, first, last)
         numbers = [s.index for s in shapes]
         tables = [
-            registry_values(job.scene, dict(zip(numbers, values, strict=True)))
+            values_of_shapes(job, dict(zip(numbers, values, strict=True)))
             for values in (start, count, faces, seams)
         ]
         dr.eval(families, tables, chart)
-        return ChainPatterns(families, tables[0], tables[1], max(count), tables[2], chart, tables[3])
+        return ChainPatterns(CopyTable.of(job), families, tables[0], tables[1], max(count), tables[2], chart, tables[3])
 
     def crossed(self, a, b, active: mi.Bool) -> tuple[mi.Bool, mi.UInt32, mi.Float]:
         """`(has one been, its family, where)` between two hits of one surface; no family: it was an edge between faces.
 
         Where: the share of the way from a to b, as if texture coordinates changed evenly.
         """
-        shape = dr.select(active, dr.reinterpret_array(mi.UInt32, a.shape), 0)
+        shape = dr.select(active, number_of(self.copies, a), 0)
         start, count = dr.gather(mi.UInt32, self.start, shape), dr.gather(mi.UInt32, self.count, shape)
         first = dr.gather(mi.UInt32, self.charted, shape)
         charted = active & (first != 0)
@@ -122,7 +124,7 @@ class ChainPatterns:
         family = self.family(number, number != NO_FAMILY)
         cell_a, cell_b = family.cell(a.uv), family.cell(b.uv)
         F, side = family.place(a.uv) - dr.maximum(cell_a, cell_b), dr.select(cell_a > cell_b, mi.Float(1), -1)
-        seam = dr.gather(mi.UInt32, self.seam, dr.reinterpret_array(mi.UInt32, a.shape), number != NO_FAMILY)
+        seam = dr.gather(mi.UInt32, self.seam, number_of(self.copies, a), number != NO_FAMILY)
         s = dr.select(seam == 1, a.uv.x, a.uv.y)
         F_seam = s - dr.round(s)
         anew = (seam != 0) & (dr.abs(F_seam) * dr.norm(family.a) < dr.abs(F))
@@ -142,6 +144,6 @@ def _charts(job: Job, facts: ShapeFacts) -> np.ndarray | None:
     """(F,) the chart of each face of a mesh; None: it has no seams."""
     if facts.kind != "mesh" or not (facts.smooth or facts.painted):
         return None
-    mesh = job.scene.shapes()[facts.index]
+    mesh = edge_shapes(job).shapes[facts.index]
     topology = known_topology(mesh, job.call.memory)
     return charts(mesh, facts.painted, (topology.host, topology.device), job.call.memory)

@@ -204,7 +204,8 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
     left = Search.begin(Interval.whole(sample, key))
     found, looks = [], FIRST_LOOKS
-    guesses = Guesses(lines.analytic, lines.job.surfaces, any(shape.smooth for shape in lines.job.facts.shapes))
+    smooth = any(shape.smooth for shape in lines.job.facts.shapes)
+    guesses = Guesses(lines.analytic, lines.copies, lines.job.surfaces, smooth)
     while left is not None:
         left = _stored(left)
         many = _width(left) > FEW

@@ -20,8 +20,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..edges.copy_table import CopyTable, number_of, values_of_shapes
+from ..edges.edge_shapes import edge_shapes
 from ..plan.job import Job
-from ..scene.registry import registry_table
+from .chain_grids import ChainGrids
 
 #: Flat surfaces: largest sine of the angle between planes that count as one, and their distance relative to the ray's.
 COPLANAR_SINE, COPLANAR_OFFSET = 2e-4, 1e-4
@@ -36,6 +38,9 @@ STEP_SLOPE, STEP_NORMAL = 0.25, 0.3
 #: Length of the difference of unit normals up to which faces are one plane: a few times their rounding.
 ONE_NORMAL = 2e-6
 
+#: The same up to which they share an edge: surfaces do not cut there, and hardly step.
+ONE_SHADING = 1e-2
+
 #: No guess of where chains part.
 NOWHERE = -1.0
 
@@ -44,30 +49,35 @@ NOWHERE = -1.0
 class ChainSurfaces:
     """What is to be known of a scene's shapes. Host object."""
 
+    copies: CopyTable | None  # of what instances show: shapes as the tables below know them
     flat: mi.UInt32  # by registry index of a shape: 1 if its faces are shaded as planes
+    loose: mi.UInt32  # the same: 1 if rays meet it next to a contour with any normal
     round: mi.UInt32  # the same: 1 if what is met of it from one side is one surface, however far apart
     horizons: bool  # are there shading normals?
+    grids: ChainGrids | None = None
     folds: bool = False  # do paths part, too, on edges between faces across which normals are interpolated?
 
     @staticmethod
     def of(job: Job) -> ChainSurfaces:
-        shapes = job.facts.shapes
+        shapes = edge_shapes(job).facts
         flat = {s.index for s in shapes if (s.is_mesh and not s.smooth) or s.plugin == "disk"}
         bulging = {s.index for s in shapes if s.plugin in ROUND}
-        tables = (registry_table(job.scene, indices) for indices in (flat, bulging))
-        return ChainSurfaces(*tables, any(s.smooth for s in shapes))
+        loose = {s.index for s in job.facts.shapes if s.kind in ("curve", "grid") and s.index >= 0}
+        tables = (values_of_shapes(job, dict.fromkeys(indices, 1)) for indices in (flat, loose, bulging))
+        return ChainSurfaces(CopyTable.of(job), *tables, any(s.smooth for s in shapes), ChainGrids.of(job))
 
     def is_flat(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Bool:
         """Is it a point of a shape whose faces are shaded as planes?"""
-        return _listed(self.flat, si, active)
+        return _listed(self.flat, number_of(self.copies, si), active)
 
     def same(self, a, b, d_a: mi.Vector3f, d_b: mi.Vector3f, k: mi.UInt32) -> mi.Bool:
         """Do two rays of directions d, segments `k` of their paths, end on one surface, or both escape? `a`, `b`:
         surface interactions.
         """
         both = a.is_valid() & b.is_valid()
-        same = (a.shape == b.shape) & (a.is_valid() == b.is_valid())
-        flat = self.is_flat(a, both & same)
+        number = number_of(self.copies, a)
+        same = (number == number_of(self.copies, b)) & (a.is_valid() == b.is_valid())
+        flat = _listed(self.flat, number, both & same)
         offset = b.p - a.p
         # not `> 0`: meshes in the wild have normals that are 0 or not numbers, and no side of theirs differs
         side = ~(dr.dot(a.n, d_a) * dr.dot(b.n, d_b) < 0)
@@ -82,14 +92,16 @@ class ChainSurfaces:
         close = (off < STEP_SLOPE * dr.norm(offset) + near) & (dr.norm(n_a - n_b) < STEP_NORMAL)
         if self.folds:
             close &= (k == 0) | ~a.shape.is_mesh() | (dr.norm(a.n - b.n) < ONE_NORMAL)
-        one_curve = side & shaded & (one_face | close | _listed(self.round, a, both & same))
+        if self.grids is not None:
+            close &= ~self.grids.bends(number, a.n, b.n) | ~self.grids.step_between(number, a.p, b.p)
+        loose = _listed(self.loose, number, both & same)
+        one_curve = (loose | (side & shaded)) & (one_face | close | _listed(self.round, number, both & same))
         return same & (~both | dr.select(flat, one_plane & side, one_curve))
 
 
-def _listed(table: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> mi.Bool:
-    """Is the shape that was met marked in a table of `ChainSurfaces`?"""
-    index = dr.select(active & si.is_valid(), dr.reinterpret_array(mi.UInt32, si.shape), 0)
-    return dr.gather(mi.UInt32, table, index) != 0
+def _listed(table: mi.UInt32, number: mi.UInt32, active: mi.Bool | bool) -> mi.Bool:
+    """Is the shape with this registry index marked in a table of `ChainSurfaces`?"""
+    return dr.gather(mi.UInt32, table, number, active) != 0
 
 
 def goes_under(si: mi.SurfaceInteraction3f, ω: mi.Vector3f) -> mi.Bool:

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
+from ..core.surface_code import top_level, top_level_of
 from ..core.varying import varying
 from ..edges.followed_lights import FollowedLights, followed_lights
 from ..paths.surface_at import surface_at
@@ -47,7 +48,7 @@ class ChainWorld:
     depth: int  # largest number of segments
     surfaces: ChainSurfaces
     patterns: ChainPatterns | None  # None: no surface steps inside
-    moving: mi.UInt32  # by registry index of a shape: 1 if steps may move because of this shape
+    moving: mi.UInt32  # by registry index of a shape or an instance: 1 if steps may move because of it
     camera: mi.Bool  # may they because the camera does, ...
     lights: mi.Bool  # ... or because lights do?
     connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
@@ -81,11 +82,11 @@ class ChainWorld:
             has_contours=any(s.kind in ROUNDED for s in facts.shapes),
         )
 
-    def moves(self, *shapes: mi.ShapePtr | mi.UInt32) -> mi.Bool:
-        """May a step move because of one of `shapes`? As pointers or by registry index."""
+    def moves(self, *surfaces: mi.SurfaceInteraction3f | Hit) -> mi.Bool:
+        """May a step move because of what was met there?"""
         found = mi.UInt32(0)
-        for shape in shapes:
-            index = shape if isinstance(shape, mi.UInt32) else dr.reinterpret_array(mi.UInt32, shape)
+        for met in surfaces:
+            index = top_level_of(met.shape) if isinstance(met, Hit) else top_level(met)
             found |= dr.gather(mi.UInt32, self.moving, index)
         return found != 0
 
@@ -230,7 +231,7 @@ def trace_pair(
             pair.lamp = dr.select(nearer, share, pair.lamp)
             pair.miss = dr.select(nearer, miss, pair.miss)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
-        pair.moves |= world.moves(a.shape, b.shape)
+        pair.moves |= world.moves(a, b)
         u = Numbers.draw(rng)
         active = ~pair.differs & a.is_valid() & (pair.k + 1 < world.depth)
 
@@ -272,7 +273,7 @@ def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active
     return replace(
         pair,
         differs=pair.differs | parts,
-        moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))),
+        moves=pair.moves | (parts & (world.lights | world.moves(hit_a, hit_b))),
         in_light=parts,
         seen=seen_a,
         light=dr.select(parts, light, pair.light),

@@ -259,7 +259,7 @@ def compare_sensor(
     return replace(
         pair,
         differs=pair.differs | parts | turned,
-        moves=pair.moves | (parts & (world.lights | world.moves(hit_a.shape, hit_b.shape))) | (turned & world.lights),
+        moves=pair.moves | (parts & (world.lights | world.moves(hit_a, hit_b))) | (turned & world.lights),
         in_light=parts,
         turned=turned,
         where=dr.select(turned, h_a / (h_a - h_b), pair.where),

@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..core.low_discrepancy import lane_sampler
 from ..core.streams import Stream, stream_seed
+from ..edges.copy_table import CopyTable
 from ..plan.job import Job
 from .chain_fixed import Directions
 from .chain_outline import AnalyticShapes
@@ -53,6 +54,11 @@ class SearchedLines(ABC):
     def analytic(self) -> AnalyticShapes | None:
         """The shapes without triangles that their chains may meet."""
         return AnalyticShapes.of(self.job)
+
+    @property
+    def copies(self) -> CopyTable | None:
+        """What stands for what instances show."""
+        return self.world.surfaces.copies
 
     def guide(self) -> None:
         """Draw the directions of all lines, if anything scatters light."""

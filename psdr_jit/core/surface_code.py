@@ -33,10 +33,15 @@ def parts_are_shapes() -> bool:
     return dr.backend_v(mi.Float) == dr.JitBackend.CUDA
 
 
-def top_level(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:
+def top_level(pi: mi.PreliminaryIntersection3f | mi.SurfaceInteraction3f) -> mi.UInt32:
     """Registry index of what `scene.shapes()` lists, a shape or an instance; 0 if nothing was met."""
     shape, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (pi.shape, pi.instance))
     return dr.select(instance != 0, instance, shape)
+
+
+def top_level_of(code: mi.UInt32) -> mi.UInt32:
+    """The same of what has this `surface_code`."""
+    return dr.select(code >= INSTANCED, code & (MOST_INSTANCES - 1), code)
 
 
 def surface_code(pi: mi.PreliminaryIntersection3f) -> mi.UInt32:

@@ -30,6 +30,17 @@ class EdgeShapes:
     shapes: tuple[mi.Shape, ...]  # by `ShapeFacts.index`; those of the scene come first
     facts: tuple[ShapeFacts, ...]  # of all but grids and the instances themselves
     grids: tuple[GridPlace, ...]  # grids of signed distances, which are not copied
+    copies: tuple[CopyPlace, ...]  # of what instances show, instance by instance; none of grids
+
+
+@dataclass(frozen=True)
+class CopyPlace:
+    """What a copy stands for."""
+
+    index: int  # of the copy itself among the shapes
+    instance: int  # index of the instance
+    child: mi.Shape
+    place: int  # of the shape in the group
 
 
 @dataclass(frozen=True)
@@ -90,6 +101,7 @@ def _found(job: Job) -> EdgeShapes:
     facts = [s for s in job.facts.shapes if s.index >= 0 and s.kind not in ("instance", "grid")]
     grids = [GridPlace(shapes[s.index], s, None, 0) for s in job.facts.shapes if s.index >= 0 and s.kind == "grid"]
     instances = [s.index for s in job.facts.shapes if s.index >= 0 and s.kind == "instance"]
+    copies: list[CopyPlace] = []
     if instances:
         groups = shape_groups(traverse(job.scene).hierarchy)
         members = {name: [s for s in job.facts.shapes if s.group == name] for name in groups}
@@ -100,9 +112,10 @@ def _found(job: Job) -> EdgeShapes:
                     grids.append(GridPlace(child, of_child, shapes[index], place))
                     continue
                 copy = _copy(job, (index, place), shapes[index], child, of_child)
+                copies.append(CopyPlace(len(shapes), index, child, place))
                 facts.append(replace(of_child, name=copy.id(), group="", index=len(shapes)))
                 shapes.append(copy)
-    return EdgeShapes(tuple(shapes), tuple(facts), tuple(grids))
+    return EdgeShapes(tuple(shapes), tuple(facts), tuple(grids), tuple(copies))
 
 
 def _group(memory: Memory, index: int, instance: mi.Shape, groups: dict[str, list[mi.Shape]]) -> str:

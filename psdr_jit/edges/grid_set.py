@@ -115,6 +115,20 @@ class GridSet:
 
     def field(self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
         """`(f, ∇f)` of a grid at a point of the world, in whatever cell it is."""
+        cell, p, duals = self._cell_at(grid, x, active)
+        g = cell.gradient(p)
+        return cell.value(p), g.x * duals[0] + g.y * duals[1] + g.z * duals[2]
+
+    def bend(self, grid: mi.UInt32, x: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+        """How ∇f changes per unit of length along d, in the cell that x is in."""
+        cell, p, duals = self._cell_at(grid, x, active)
+        h = cell.bend(p, mi.Vector3f(*(dr.dot(dual, d) for dual in duals)))
+        return h.x * duals[0] + h.y * duals[1] + h.z * duals[2]
+
+    def _cell_at(
+        self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool
+    ) -> tuple[Cell, mi.Vector3f, list[mi.Vector3f]]:
+        """The cell around a point of the world, the point in its coordinates, and the gradients of these."""
         columns, inverse = ([dr.gather(mi.Vector3f, c, grid, active) for c in t] for t in (self.columns, self.inverse))
         size = dr.select(active, dr.gather(mi.UInt32, self.size, grid, active), 2)
         cells = mi.Float(size - 1)
@@ -124,9 +138,7 @@ class GridSet:
         corners = [at + i + size * j for j in (0, 1) for i in (0, 1)]
         f = [[dr.gather(mi.Float, self.values, c + size * size * k, active) for c in corners] for k in (0, 1)]
         p = mi.Vector3f(*(a - mi.Float(c) for a, c in zip(q, corner, strict=True)))
-        cell = Cell(*f)
-        g = cell.gradient(p)
-        return cell.value(p), (g.x * inverse[0] + g.y * inverse[1] + g.z * inverse[2]) * cells
+        return Cell(*f), p, [mi.Vector3f(i * cells) for i in inverse]
 
 
 def grid_set(places: tuple[GridPlace, ...]) -> GridSet | None:

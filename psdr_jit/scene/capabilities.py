@@ -143,7 +143,7 @@ SUPPORT = (
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "yes",
-        _MOVING + "beside instances, curves, SDF grids and ellipsoids: error; seen in them, frames of projectors and "
+        _MOVING + "beside SDF grids that instances show: error; seen in them, frames of projectors and "
         "hard rims: warning; edges mirrored at the very rim of a ball: up to a third of their pixels is missing; masks "
         "before nothing: the image is that of `prb`, `path` drops light there"),
     Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",

@@ -155,13 +155,13 @@ def check_specular(facts: SceneFacts) -> Iterator[Finding]:
     """Directions follow delta lobes; what cannot be followed is refused, what is not sampled behind them is named."""
     if not facts.geometry_moves:
         return
-    beside = next((s.name for s in facts.shapes if s.kind in ("instance",)), "")
+    beside = next((s.name for s in facts.shapes if s.kind == "grid" and s.group), "")
     for shape in facts.shapes:
         if not shape.delta_lobes:
             continue
         label = f"shape '{shape.name}' has the BSDF '{shape.bsdf}' with perfectly specular or pass-through lobes"
         lobes = ", ".join(shape.delta_lobes)
-        others = beside and f"the scene has an instance, a curve, a grid or ellipsoids, '{beside}', beside it"
+        others = beside and f"an instance shows the grid '{beside}' beside it"
         obstacle = shape.delta_obstacle or others
         if obstacle:
             yield Finding(

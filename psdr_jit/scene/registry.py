@@ -25,7 +25,13 @@ def registry_indices(scene: mi.Scene) -> list[int]:
 def registry_values(scene: mi.Scene, values: Mapping[int, int]) -> mi.UInt32:
     """By registry index of a shape: the value given for its number in `scene.shapes()`, or 0."""
     ids = registry_indices(scene)
-    table = [0] * (max(ids, default=0) + 1)
+    return values_by_registry({ids[index]: value for index, value in values.items()}, max(ids, default=0))
+
+
+def values_by_registry(values: Mapping[int, int], last: int = 0) -> mi.UInt32:
+    """By registry index: the value given for it, or 0, up to at least the index `last`."""
+    table = [0] * (max(values, default=0) + 1)
+    table += [0] * (last + 1 - len(table))
     for index, value in values.items():
-        table[ids[index]] = value
+        table[index] = value
     return mi.UInt32(table)

@@ -13,6 +13,7 @@ from psdr_jit.boundary.chain_guess import NOWHERE, Guesses
 from psdr_jit.boundary.chain_outline import AnalyticShapes
 from psdr_jit.boundary.chain_trace import Pair
 from psdr_jit.core.records import Hit
+from psdr_jit.edges.edge_shapes import SHAPES, EdgeShapes
 
 #: Half of the angle between the rays of a pair, and the error that a straight line may have there.
 HALF, TOLERANCE = 0.02, 0.03
@@ -80,5 +81,6 @@ def test_guesses_are_where_halving_ends(name, llvm):
 
 def _guesses(scene: mi.Scene) -> Guesses:
     shapes = [SimpleNamespace(index=i, plugin=s.class_name().lower()) for i, s in enumerate(scene.shapes())]
-    job = SimpleNamespace(scene=scene, facts=SimpleNamespace(shapes=shapes))
-    return Guesses(AnalyticShapes.of(job), None, smooth=False)
+    known = {SHAPES: EdgeShapes(tuple(scene.shapes()), tuple(shapes), (), ())}
+    job = SimpleNamespace(scene=scene, shared=known)
+    return Guesses(AnalyticShapes.of(job), None, None, smooth=False)

@@ -24,7 +24,7 @@ class Striped:
     Awkward ones are taken to differ where they are far apart, and see a step that rests.
     """
 
-    narrowest, first_kept, analytic = 2.0**-10, 0, None
+    narrowest, first_kept, analytic, copies = 2.0**-10, 0, None, None
 
     def __init__(self, start: np.ndarray, width: float, lamp: bool, awkward: bool):
         self.count, self.start, self.width = len(start), mi.Float(start.astype(np.float32)), width

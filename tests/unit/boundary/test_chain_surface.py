@@ -18,7 +18,7 @@ def test_a_face_without_normals_is_one_surface(llvm, broken):
     """Scanned meshes have such faces: a point of theirs is not apart from itself."""
     scene = mi.load_dict({"type": "scene", "sheet": {"type": "rectangle"}})
     none, d = dr.zeros(mi.UInt32, 4), mi.Vector3f(0, 0, -1)
-    surfaces = ChainSurfaces(none, none, horizons=True)
+    surfaces = ChainSurfaces(None, none, none, none, horizons=True)
     a, b = hit(scene, 0.1, 0.2), hit(scene, 0.1, 0.2)
     for si in (a, b):
         if broken == "shading normal":

@@ -46,8 +46,9 @@ def curve_on(scene: mi.Scene) -> Curve:
     hit = dr.select(no, hit, hit)  # as wide as the others
     slope = mi.Vector3f(mi.Float(SLOPES), 0, 0)
     m = replace(hit, shape=dr.select(dr.arange(mi.UInt32, LANES) == 1, 0, hit.shape))  # of the second, on nothing
-    return Curve(hit, no, no, mi.Vector3f(0), no, mi.Vector2f(0), no, nothing, m, m, slope, mi.Vector3f(0), nothing,
-                 slope.x, dr.isfinite(slope.x))  # fmt: skip
+    zero = mi.Vector3f(0)
+    return Curve(hit, no, no, zero, no, mi.Vector2f(0), no, nothing, m, m, slope, zero, zero, nothing, slope.x,
+                 dr.isfinite(slope.x))  # fmt: skip
 
 
 def adjoints(λ: tuple[float, ...], first: tuple | None = None):
