@@ -79,12 +79,14 @@ def _inside_edge(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
     """Of a mesh's edge: the segment that ends at it, moved inside of its face by more than rounding.
 
     Lines are halved until what they meet is as close to the edge as a hit is known: of an outline it may be the face
-    behind, met from its back.
+    behind, met from its back, and what is seen of it a step of its own that does not count. Faces met from their front
+    stay: what lies between the edge and a line of a pattern on it, by rounding, is counted for both.
     """
     edge = curve.valid & ~(curve.cut | curve.pattern | curve.shading | curve.horizon)
 
     def moved(hit: Hit, active: mi.Bool) -> Hit:
-        on_mesh, corners = triangle(world.surfaces.copies, hit, active & edge)
+        behind = dr.dot(surface_of(world.tables, hit, active & edge).n, hit.d) > 0
+        on_mesh, corners = triangle(world.surfaces.copies, hit, active & edge & behind)
         inward = dr.sign(dr.dot((corners[0] + corners[1] + corners[2]) / 3 - curve.m1.o, curve.c1)) * curve.c1
         step = INSIDE * ROUNDING * (1 + dr.max(dr.abs(curve.m1.o)))
         return _moved(world.scene, hit, step * inward, on_mesh)
