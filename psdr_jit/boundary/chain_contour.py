@@ -5,11 +5,11 @@ nearly at right angles to the line of sight d. On the way to the contour n turns
 
     n_c ∝ n − (n·d) / (e·d) e,        n_c·d = 0,
 
-round the axis of a tube (whose rulings have one normal), in a grid as the
-second derivatives of its values say, elsewhere towards d. What is left is of second order in
-n·d, a few thousandths; of linear curves, which Mitsuba meets to about a thousandth of their radius, some
-hundredths of a tilt. Of B-splines it is taken where the axis passes closest by. Their tubes are open, and end at a rim
-round the axis. A grid may end on the face of a cell as well (`chain_grids`).
+round the axis of a tube (whose rulings have one normal), in a grid as the second derivatives of its values say, and
+elsewhere towards d. What is left is of second order in n·d, a few thousandths; of linear curves, which Mitsuba meets to
+about a thousandth of their radius, some hundredths of a tilt. Of B-splines, whose hits know their place on the curve
+badly, the contour is sought where it passes closest by. Their tubes are open, and end at a rim round the axis. A grid
+may end on the face of a cell as well (`chain_grids`).
 """
 
 from __future__ import annotations
