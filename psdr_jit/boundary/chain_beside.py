@@ -34,7 +34,7 @@ SAME_EDGE = 0.02
 
 
 def beside_curve(world: ChainWorld, pair: Pair, curve: Curve) -> Pair:
-    """The last segments clear of a crossed line of a pattern, of a cut, or of a sharp edge; others as they are."""
+    """The last segments clear of a crossed line of a pattern, a cut, an edge or a contour; others as they are."""
     if world.patterns is not None:
         pair = _beside_line(world, pair, curve)
     pair = _beside_sharp_edges(world, _beside_cut(world, _inside_edge(world, pair, curve), curve))

@@ -57,7 +57,7 @@ class ChainGrids:
         """Do two points of one shape, by registry index, lie in different cells of a grid that shows its cells?"""
         grid, met = self._grid(shape)
         shown = met & (dr.gather(mi.UInt32, self.stepped, grid, met) != 0)
-        cell_a, cell_b = (dr.floor(self._local(grid, x, shown)[0]) for x in (a, b))
+        cell_a, cell_b = (dr.floor(self.grids.local(grid, x, shown)[0]) for x in (a, b))
         return shown & dr.any(cell_a != cell_b)
 
     def side(self, shape: mi.UInt32, a, b, d: mi.Vector3f, n: mi.Vector3f) -> mi.Float:
@@ -66,7 +66,7 @@ class ChainGrids:
         `a`, `b`: what is seen on both sides of a bend. 0: they lie in one cell, or on no grid.
         """
         grid, met = self._grid(shape)
-        (q_a, duals), (q_b, _) = (self._local(grid, si.p, met) for si in (a, b))
+        (q_a, duals), (q_b, _) = (self.grids.local(grid, si.p, met) for si in (a, b))
         shifted = n - d * (dr.dot(a.n, n) / dr.dot(a.n, d))  # on the surface of a
         side = mi.Float(0)
         for axis in range(3):
@@ -77,7 +77,7 @@ class ChainGrids:
     def face(self, shape: mi.UInt32, x: mi.Point3f) -> tuple[mi.Vector3f, mi.Bool]:
         """`(normal, whether there is one)` of the face of a cell that a point of a shape is next to. Of any length."""
         grid, met = self._grid(shape)
-        q, duals = self._local(grid, x, met)
+        q, duals = self.grids.local(grid, x, met)
         away, a = mi.Float(NEXT_TO), mi.Vector3f(0)
         for axis in range(3):
             own = dr.abs(q[axis] - dr.round(q[axis]))
@@ -98,14 +98,11 @@ class ChainGrids:
         for edges that are seen directly, the first point is taken at which they do not (`edges.kind_grid`).
         """
         grid, met = self._grid(shape)
-        size = dr.rcp(dr.norm(self._local(grid, x, met)[1][0]) * (dr.gather(mi.UInt32, self.grids.size, grid, met) - 1))
+        size = dr.rcp(dr.norm(self.grids.local(grid, x, met)[1][0]))
         blended = met & (dr.gather(mi.UInt32, self.stepped, grid, met) == 0)
         chosen, found = mi.Vector3f(0), mi.Bool(False)
         for away in (OFF, *AWAY):
-            y = mi.Point3f(x - away * size * d)
-            for _ in range(2):
-                f, g = self.grids.field(grid, y, met)
-                y -= f / dr.maximum(dr.squared_norm(g), dr.smallest(mi.Float)) * g
+            y = self.grids.onto(grid, mi.Point3f(x - away * size * d), met)
             si = replace(hit, o=mi.Point3f(y - hit.t * d), d=d).interaction(blended)
             shown = ~blended | (dr.dot(si.sh_frame.n, d) * dr.dot(si.n, d) > 0)
             chosen = dr.select(shown & ~found, y - x, chosen)
@@ -115,10 +112,3 @@ class ChainGrids:
     def _grid(self, shape: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
         number = dr.gather(mi.UInt32, self.number, shape)
         return dr.maximum(number, 1) - 1, number != 0
-
-    def _local(self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, list[mi.Vector3f]]:
-        """A point in units of cells, and the gradients of its coordinates."""
-        origin = dr.gather(mi.Vector3f, self.grids.columns[3], grid, active)
-        duals = [dr.gather(mi.Vector3f, axis, grid, active) for axis in self.grids.inverse]
-        cells = mi.Float(dr.gather(mi.UInt32, self.grids.size, grid, active)) - 1
-        return mi.Vector3f(*(dr.dot(mi.Vector3f(x) - origin, dual) * cells for dual in duals)), duals

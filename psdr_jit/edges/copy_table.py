@@ -14,11 +14,16 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.joining import pointers
+from ..core.memory import Slot
 from ..core.surface_code import INSTANCED, MOST_INSTANCES, PART_SHIFT, parts_are_shapes, registry_index
 from ..core.upload import uploaded
 from ..plan.job import Job
 from ..scene.registry import values_by_registry
 from .edge_shapes import edge_shapes
+
+#: Of one render call: the registry indices of its shapes, and its copies.
+NUMBERS: Slot[np.ndarray | None] = Slot(lambda: None)
+COPIES: Slot[CopyTable | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,11 @@ class CopyTable:
 
     @staticmethod
     def of(job: Job) -> CopyTable | None:
-        """None if there are no instances. What an instance shows of grids has no copy: number 0."""
+        """None if there are no instances. What an instance shows of grids has no copy: number 0. Made once per call."""
+        return job.shared.once(COPIES, lambda: CopyTable._made(job))
+
+    @staticmethod
+    def _made(job: Job) -> CopyTable | None:
         found = edge_shapes(job)
         if not found.copies:
             return None
@@ -74,7 +83,11 @@ def number_of(copies: CopyTable | None, si: mi.SurfaceInteraction3f) -> mi.UInt3
 
 
 def shape_numbers(job: Job) -> np.ndarray:
-    """By number of a shape, copies included: its registry index."""
+    """By number of a shape, copies included: its registry index. Asked for once per call."""
+    return job.shared.once(NUMBERS, lambda: _shape_numbers(job))
+
+
+def _shape_numbers(job: Job) -> np.ndarray:
     return np.array(dr.reinterpret_array(mi.UInt32, pointers(mi.ShapePtr, edge_shapes(job).shapes)))
 
 

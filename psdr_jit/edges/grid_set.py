@@ -15,6 +15,9 @@ from ..scene.grids import VALUES
 from .edge_shapes import GridPlace
 from .grid_rows import GridPieces, grid_pieces
 
+#: Steps of Newton's method from a point within a cell of the surface onto it.
+NEWTON_STEPS = 2
+
 
 @dataclass
 class GridRows:
@@ -119,6 +122,21 @@ class GridSet:
         g = cell.gradient(p)
         return cell.value(p), g.x * duals[0] + g.y * duals[1] + g.z * duals[2]
 
+    def onto(self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> mi.Point3f:
+        """The point of the surface near x, by Newton's method along ∇f."""
+        for _ in range(NEWTON_STEPS):
+            f, g = self.field(grid, x, active)
+            x = x - f / dr.maximum(dr.squared_norm(g), dr.smallest(mi.Float)) * g
+        return x
+
+    def local(self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, list[mi.Vector3f]]:
+        """A point in units of cells, and the gradients of its coordinates."""
+        origin = dr.gather(mi.Vector3f, self.columns[3], grid, active)
+        inverse = [dr.gather(mi.Vector3f, i, grid, active) for i in self.inverse]
+        cells = mi.Float(dr.select(active, dr.gather(mi.UInt32, self.size, grid, active), 2) - 1)
+        q = mi.Vector3f(*(dr.dot(mi.Vector3f(x) - origin, i) * cells for i in inverse))
+        return q, [mi.Vector3f(i * cells) for i in inverse]
+
     def bend(self, grid: mi.UInt32, x: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """How ∇f changes per unit of length along d, in the cell that x is in."""
         cell, p, duals = self._cell_at(grid, x, active)
@@ -129,16 +147,15 @@ class GridSet:
         self, grid: mi.UInt32, x: mi.Point3f, active: mi.Bool
     ) -> tuple[Cell, mi.Vector3f, list[mi.Vector3f]]:
         """The cell around a point of the world, the point in its coordinates, and the gradients of these."""
-        columns, inverse = ([dr.gather(mi.Vector3f, c, grid, active) for c in t] for t in (self.columns, self.inverse))
+        q, duals = self.local(grid, x, active)
         size = dr.select(active, dr.gather(mi.UInt32, self.size, grid, active), 2)
-        cells = mi.Float(size - 1)
-        q = [dr.clip(dr.dot(mi.Vector3f(x) - columns[3], i), 0, 1) * cells for i in inverse]
+        q = dr.clip(q, 0, mi.Float(size - 1))
         corner = [dr.minimum(mi.UInt32(a), size - 2) for a in q]
         at = dr.gather(mi.UInt32, self.first, grid, active) + corner[0] + size * (corner[1] + size * corner[2])
         corners = [at + i + size * j for j in (0, 1) for i in (0, 1)]
         f = [[dr.gather(mi.Float, self.values, c + size * size * k, active) for c in corners] for k in (0, 1)]
         p = mi.Vector3f(*(a - mi.Float(c) for a, c in zip(q, corner, strict=True)))
-        return Cell(*f), p, [mi.Vector3f(i * cells) for i in inverse]
+        return Cell(*f), p, duals
 
 
 def grid_set(places: tuple[GridPlace, ...]) -> GridSet | None:

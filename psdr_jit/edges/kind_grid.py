@@ -218,9 +218,8 @@ class GridEdges(ContourKind):
         size, shown = _size(at.frame), mi.Point3f(x)
         for away in (0.0, *AWAY):
             y = mi.Point3f(x - away * size * sight.ω)
-            for _ in range(2 if away > 0 else 0):
-                f, g = self.grids.field(at.rows.grid, y, active)
-                y = y - f / dr.maximum(dr.squared_norm(g), dr.smallest(mi.Float)) * g
+            if away > 0:
+                y = self.grids.onto(at.rows.grid, y, active)
             pi = self._on_surface(at, sight.r, active)
             ray = mi.Ray3f(y - sight.r * sight.ω, sight.ω)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)

@@ -45,11 +45,9 @@ class TubeRows:
 
 def tube_rows(tubes: Splines) -> TubeRows:
     """Pieces of all B-spline curves."""
-    first, owner = (np.array(a).astype(np.int64) for a in (tubes.first, tubes.owner))
-    moves = np.array(tubes.moves)[owner]
-    segment = np.arange(len(first))
-    starts = np.concatenate([[True], (np.diff(first) != 1) | (np.diff(owner) != 0)])
-    ends = np.append(starts[1:], True)
+    moves = np.array(tubes.moves)[np.array(tubes.owner)]
+    segment = np.arange(len(moves))
+    starts, ends = (np.array(a) for a in tubes.ends(dr.arange(mi.UInt32, len(moves)), mi.Bool(True)))
     columns = []
     for side in (-1, 1):
         for piece in range(PIECES):

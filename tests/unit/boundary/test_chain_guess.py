@@ -12,6 +12,7 @@ import pytest
 from psdr_jit.boundary.chain_guess import NOWHERE, Guesses
 from psdr_jit.boundary.chain_outline import AnalyticShapes
 from psdr_jit.boundary.chain_trace import Pair
+from psdr_jit.core.memory import Memory
 from psdr_jit.core.records import Hit
 from psdr_jit.edges.edge_shapes import SHAPES, EdgeShapes
 
@@ -81,6 +82,7 @@ def test_guesses_are_where_halving_ends(name, llvm):
 
 def _guesses(scene: mi.Scene) -> Guesses:
     shapes = [SimpleNamespace(index=i, plugin=s.class_name().lower()) for i, s in enumerate(scene.shapes())]
-    known = {SHAPES: EdgeShapes(tuple(scene.shapes()), tuple(shapes), (), ())}
+    known = Memory()
+    known[SHAPES] = EdgeShapes(tuple(scene.shapes()), tuple(shapes), (), ())
     job = SimpleNamespace(scene=scene, shared=known)
     return Guesses(AnalyticShapes.of(job), None, None, smooth=False)
