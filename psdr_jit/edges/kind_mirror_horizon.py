@@ -161,6 +161,9 @@ class MirrorHorizons(CurvesWithinFaces):
     def of_corners(self, p: list[mi.Point3f], n: list[mi.Normal3f]) -> Face:
         return MirroredFace(p, n)
 
+    def other_curve(self, face: Face) -> Face:
+        return Face(face.p, face.n)
+
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Length of the curve on the film; where only a part of it, or of the lens, sees one, that of the face."""
         rows, face = self.faces.rows, self.all_faces()
@@ -188,5 +191,5 @@ class MirrorHorizons(CurvesWithinFaces):
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         rows, face = self.face(row, active)
         curve = face.curve(t, view)
-        seen = dr.dot(face.n_g, curve.ω) * rows.shell <= 0  # a closed surface is seen from outside
+        seen = self.seen(rows, face, curve.ω)
         return self.point(face, curve.b, curve.ω, curve.weight, active & curve.valid & seen)

@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..core.sensor_frame import SensorFrame, viewpoint
 from .film_cover import LENS_CENTRE, curve_cover
 from .kind import OnEdge, Use
+from .kind_mirror_horizon import MirroredFace
 from .kind_within_faces import CurvesWithinFaces
 from .shading_curve import Face, curve_on, may_cross
 
@@ -28,6 +29,9 @@ class ShadingOutlines(CurvesWithinFaces):
 
     def of_corners(self, p: list[mi.Point3f], n: list[mi.Normal3f]) -> Face:
         return Face(p, n)
+
+    def other_curve(self, face: Face) -> Face:
+        return MirroredFace(face.p, face.n)
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Length of the curve on the film; where a lens may see one that its centre does not, that of the face."""
@@ -53,5 +57,5 @@ class ShadingOutlines(CurvesWithinFaces):
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         rows, face = self.face(row, active)
         curve = curve_on(face, t, view)
-        seen = dr.dot(face.n_g, curve.ω) * rows.shell <= 0  # a closed surface is seen from outside
+        seen = self.seen(rows, face, curve.ω)
         return self.point(face, curve.b, curve.ω, curve.weight, active & curve.valid & seen)

@@ -27,12 +27,15 @@ import mitsuba as mi
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Views
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import VISIBILITY_EPSILON, clearance
+from .points import VISIBILITY_EPSILON, clearance, facing
 from .shading_curve import Face
 from .smooth_faces import FaceRows, SmoothFaces
 
 #: Barycentric step to the side at which the radiance of the face is taken.
 STEP_ASIDE = 1e-3
+
+#: Where it would lead across the face's other curve, the share of the way there.
+SHORT_OF_IT = 0.5
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,16 @@ class CurvesWithinFaces(EdgeKind):
     @abstractmethod
     def of_corners(self, p: list[mi.Point3f], n: list[mi.Normal3f]) -> Face:
         """The face with the vector n of h = n·ω, of these corners."""
+
+    @staticmethod
+    def seen(rows: FaceRows, face: Face, ω: mi.Vector3f) -> mi.Bool:
+        """Not edge-on, as edges of meshes have it, and a closed surface from outside."""
+        towards = facing(dr.normalize(face.n_g), -ω)
+        return (towards != 0) & (towards * rows.shell >= 0)
+
+    @abstractmethod
+    def other_curve(self, face: Face) -> Face:
+        """A face of ours with the vector n of the other kind of curve within faces."""
 
     def all_faces(self) -> Face:
         """By row."""
@@ -108,13 +121,16 @@ class CurvesWithinFaces(EdgeKind):
         )
 
     def side(self, row: mi.UInt32, sight: Sight, which: mi.UInt32, active: mi.Bool) -> Side:
-        """The face itself, a step away from the curve."""
+        """The face itself, a step away from the curve; seen edge-on, it has its other curve next to it."""
         rows, face = self.face(row, active)
         b = mi.Point2f(sight.at.local.x, sight.at.local.y)
         m = face.gradient(sight.ω, b)
         towards = dr.select(which == 0, -1.0, 1.0) * dr.sign(dr.dot(m, sight.n_perp))
         step = face.barycentric(m)
         step *= STEP_ASIDE * towards / dr.maximum(dr.abs(step.x), dr.abs(step.y))
+        other = self.other_curve(face)
+        h, h_there = dr.dot(other.normal(b), sight.ω), dr.dot(other.normal(b + step), sight.ω)
+        step *= dr.select((h > 0) != (h_there > 0), SHORT_OF_IT * h / (h - h_there), 1)
         pi = dr.zeros(mi.PreliminaryIntersection3f)
         pi.valid = active
         pi.t = dr.select(pi.valid, sight.r, dr.inf)

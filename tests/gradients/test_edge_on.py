@@ -139,3 +139,22 @@ def test_the_shadow_of_a_box_lit_along_its_faces(llvm, lamp):
         assert_right(scene)
     else:
         assert_alike(scene, nearby)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("heights", [(0.0, -1e-3), (4e-4, 2e-3)])
+def test_a_face_of_a_mirror_that_is_barely_seen(llvm, heights):
+    """Where it turns away and where it mirrors its own inside lie next to each other; in line, it has neither."""
+    vertices, faces = meshes.ball(8, 16)
+    corners = vertices[faces[len(faces) // 2 + 5]]
+    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    n /= np.linalg.norm(n)
+    images = []
+    for height in heights:
+        eye = corners.mean(0) + 4 * np.cross(n, [0, 1, 0]) + height * n
+        ball = meshes.smooth_mesh("box", vertices, faces, mi.load_dict({"type": "conductor"}))
+        camera = perspective(eye, corners.mean(0)) | {"fov": 12}
+        description = {"type": "scene", "camera": camera, "box": ball, "sky": {"type": "constant"}}
+        scene = mi.load_dict(description, optimize=False)
+        images.append(forward(perturb(scene, "box.vertex_positions", DIRECTION), SPEC, 8, 512).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.05 * np.linalg.norm(images[1])
