@@ -13,6 +13,14 @@ UNEVEN_SCALE = 1e-4
 
 POSE = "to_world"
 
+#: Shapes that rays meet in object space, while all else about them is put into world space.
+MET_IN_OBJECT_SPACE = ("disk", "instance")
+
+_ONE_WAY = (
+    "has a to_world whose inverse Mitsuba has wrong, so that rays meet it elsewhere than it is; give rotations axes of "
+    "length 1, or make it of its matrix alone"
+)
+
 _TURNED = (
     "is turned or mirrored by its to_world, which Mitsuba does not support: it shades it as if it was not; put it into "
     "a shapegroup and turn an instance of it"
@@ -21,11 +29,13 @@ _TURNED = (
 
 def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
     """What is wrong with the pose of a shape, and the way out; "" where nothing is, or while a function is frozen."""
-    if plugin not in (*GRID_SHAPES, "sphere", "cylinder"):
+    if plugin not in (*GRID_SHAPES, *MET_IN_OBJECT_SPACE, "sphere", "cylinder"):
         return ""
     matrix = _pose_of(graph, shape)
     if matrix is None:
         return ""
+    if plugin in MET_IN_OBJECT_SPACE:
+        return "" if _inverts(graph, shape, matrix) else _ONE_WAY
     if plugin in GRID_SHAPES:
         return _TURNED if _turns(matrix) else ""
     if stretches(matrix, plugin):
@@ -58,6 +68,14 @@ def _pose_of(graph: SceneGraph, node: mi.Object) -> np.ndarray | None:
     """(4, 4); None while a function is being frozen."""
     matrix = on_host_or_none(graph.value(node, POSE).matrix)
     return None if matrix is None else matrix.reshape(4, 4)
+
+
+def _inverts(graph: SceneGraph, shape: mi.Shape, matrix: np.ndarray) -> bool:
+    """Does Mitsuba know how to undo this map? Of a rotation about an axis of another length than 1 it does not."""
+    back = on_host_or_none(graph.value(shape, POSE).inverse_transpose)
+    if back is None:
+        return True
+    return bool(np.abs(matrix[:3, :3] @ back.reshape(4, 4)[:3, :3].T - np.eye(3)).max() <= UNEVEN_SCALE)
 
 
 def stretches(matrix: np.ndarray, plugin: str) -> bool:

@@ -47,3 +47,14 @@ def test_skies_that_are_more_than_turned(pose, told):
            "to_world": getattr(mi.ScalarTransform4f(), how)(*arguments)}  # fmt: skip
     found = complaints("env.scale", env=sky, floor={"type": "rectangle"})
     assert ((UnsupportedWarning, "env") in found) == told
+
+
+@pytest.mark.parametrize("plugin", ["disk", "instance", "rectangle"])
+@pytest.mark.parametrize(("axis", "told"), [([0, 1, 1], True), ([0, 0.6, 0.8], False)])
+def test_rotations_about_long_axes(plugin, axis, told):
+    """Mitsuba takes the transpose for the inverse. Rays meet meshes, and rectangles, where they are all the same."""
+    objects = {"x": {"type": plugin, "to_world": mi.ScalarTransform4f().translate([1e3, 0, 0]).rotate(axis, 50)}}
+    if plugin == "instance":
+        objects["x"]["g"] = {"type": "ref", "id": "g"}
+        objects = {"g": {"type": "shapegroup", "box": {"type": "cube"}}} | objects
+    assert ((SceneError, "x") in complaints("sensor.to_world", **objects)) == (told and plugin != "rectangle")
