@@ -198,7 +198,8 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
     block = block or default_block(size)
     f1, f2 = reference.halves
     while True:
-        verdict = judge(estimate.images, f1, f2, block, floor=reference.floor(block), **rule)
+        unseen = {"floor": reference.floor(block), "rare": reference.rare(block)}
+        verdict = judge(estimate.images, f1, f2, block, **unseen, **rule)
         now = time.perf_counter()
         if progress is not None:
             progress(now - start, verdict)

@@ -70,7 +70,7 @@ class CentralDifference:
         self.spp = spp or default_spp(self.sensor)
         require_samples(self.sensor, self.spp)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
-        self.primal = GroupedImages(groups=1)
+        self.primal, self._primal_squares = GroupedImages(groups=1), GroupedImages(groups=1)
         self.seconds = 0.0
         self._next_seed = FD_SEED
 
@@ -91,12 +91,33 @@ class CentralDifference:
         """
         primal = np.abs(block_means(self.primal.mean(), block))
         rounding = np.finfo(np.float32).eps * np.sqrt(self.spp) * primal / self.eps
-        padded = np.pad(primal, ((1, 1), (1, 1), (0, 0)))
-        nearby = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(0, 1)).max((-2, -1))
-        one_sample = nearby / (2 * self.eps * self.spp * block**2 * 2 * self.seeds)
+        one_sample = self._per_sample(primal, block)
         halves = np.concatenate([half.group_means() for half in self.halves])
         seen = standard_error(block_means(halves, block)) > rounding
         return np.where(seen, rounding, np.hypot(rounding, one_sample))
+
+    def rare(self, block: int) -> np.ndarray:
+        """What one event more or less, a sample that an edge passes over, changes of block means (h, w, C).
+
+        Where few have occurred, the scatter between seeds is a matter of chance. An event is as bright as samples that
+        are bright at all: E[L²]/E[L], of the seeds' own scatter.
+        """
+        mean = self.primal.mean()
+        square = mean**2 + self.spp * np.maximum(self._primal_squares.mean() - mean**2, 0)
+        light, power = block_means(np.abs(mean), block), block_means(square, block)
+        bright = np.divide(power, light, out=np.zeros_like(power), where=light > 0)
+        return self._per_sample(bright, block)
+
+    def _per_sample(self, brightness: np.ndarray, block: int) -> np.ndarray:
+        """How far a single sample of the largest brightness nearby moves block means (h, w, C)."""
+        padded = np.pad(brightness, ((1, 1), (1, 1), (0, 0)))
+        nearby = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(0, 1)).max((-2, -1))
+        return nearby / (2 * self.eps * self.spp * block**2 * 2 * self.seeds)
+
+    def note_primal(self, image: np.ndarray) -> None:
+        """Take down the image of one seed, on one side of the difference."""
+        self.primal.add(image)
+        self._primal_squares.add(np.square(image, dtype=np.float64))
 
     def add(self, seeds: int) -> None:
         """Render `seeds` more seeds for each half: four renderings per seed."""
@@ -115,7 +136,7 @@ class CentralDifference:
         below = [self._render(seed) for seed in seeds]
         self.perturbation.restore()
         for image in above:
-            self.primal.add(image)
+            self.note_primal(image)
         return [(a - b) / (2 * self.eps) for a, b in zip(above, below, strict=True)]
 
     def _render(self, seed: int) -> np.ndarray:

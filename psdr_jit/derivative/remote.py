@@ -155,5 +155,5 @@ class RemoteDifference(CentralDifference):
     def differences(self, seeds: Sequence[int]) -> list[np.ndarray]:
         found = list(self._engine.ordered(difference_unit, [(*self._unit, seed) for seed in seeds]))
         for _, above in found:
-            self.primal.add(above)
+            self.note_primal(above)
         return [image for image, _ in found]

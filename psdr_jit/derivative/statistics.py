@@ -117,6 +117,10 @@ def gain(d: np.ndarray, f1: np.ndarray, f2: np.ndarray) -> Gain:
                 float(np.sqrt(power_variance[1] + power_variance[2])))
 
 
+#: |z| from which on a block's measured error is asked whether it is that of few events.
+SURPRISING = 3.0
+
+
 @dataclass(frozen=True)
 class BlockTest:
     """z-scores of block means of two images."""
@@ -128,12 +132,13 @@ class BlockTest:
 
 
 def block_test(d: np.ndarray, f: np.ndarray, block: int,
-               floor: float | np.ndarray = 0.0) -> BlockTest:
+               floor: float | np.ndarray = 0.0, rare: float | np.ndarray = 0.0) -> BlockTest:
     """z = (mean d - mean f) / sqrt(se_d^2 + se_f^2 + floor^2) for each block of pixels and channel.
 
     `d`, `f`: group means (G, H, W, C). `floor` (h, w, C) is an error that the scatter between groups does not
     show; blocks whose measured error lies below it count towards max_z only, since the root mean
-    square of their z says nothing.
+    square of their z says nothing. `rare` (h, w, C) is what one event changes: where few have occurred, the scatter may
+    be far too small. It counts as an error of blocks that are off by more than `SURPRISING`.
     """
     d, f = block_means(d, block), block_means(f, block)
     variance = standard_error(d) ** 2 + standard_error(f) ** 2
@@ -141,7 +146,8 @@ def block_test(d: np.ndarray, f: np.ndarray, block: int,
     active = (variance > 0) | (difference != 0)
     measured = variance > floor**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(active, difference / np.sqrt(variance + floor**2), 0.0)
-    z = np.nan_to_num(z, nan=0.0)
+        z, far = (np.nan_to_num(np.where(active, difference / np.sqrt(total), 0.0), nan=0.0)
+                  for total in (variance + floor**2, variance + floor**2 + rare**2))  # fmt: skip
+    z = np.where(np.abs(z) > SURPRISING, far, z)
     rms = float(np.sqrt(np.mean(z[measured] ** 2))) if measured.any() else float("nan")
     return BlockTest(rms, float(np.abs(z).max(initial=0.0)), int(measured.sum()), z)

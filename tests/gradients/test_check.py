@@ -122,6 +122,18 @@ def test_z_scores_of_honest_errors_are_standard_normal(truth):
     assert 0.9 < test.rms_z < 1.15 and test.max_z < 5 and test.blocks == 16 * 16 * 3
 
 
+@pytest.mark.parametrize("events", [3, 300])
+def test_what_few_events_show_is_uncertain(events):
+    """Per block: their scatter says 0 where none has occurred but small changes. What is wrong stays wrong."""
+    rng, groups = np.random.default_rng(1), 64
+    small = 0.01 * rng.standard_normal((2, groups, 16, 16, 3))
+    f = rng.poisson(events / groups, small[0].shape) * groups / events + small[0]
+    for truth, right in ((1, True), (0, events < 10)):
+        d, one = truth + small[1], 1 / events
+        assert (block_test(d, f, 1, rare=one).max_z < 6) == right
+    assert events > 10 or block_test(1 + small[1], f, 1).max_z > 30
+
+
 @pytest.fixture(scope="module")
 def card():
     activate("llvm_ad_rgb")
