@@ -198,8 +198,7 @@ def _collect(estimate: DerivativeSampler, reference: CentralDifference, block: i
     block = block or default_block(size)
     f1, f2 = reference.halves
     while True:
-        unseen = {"floor": reference.floor(block), "rare": reference.rare(block)}
-        verdict = judge(estimate.images, f1, f2, block, **unseen, **rule)
+        verdict = judge(estimate.images, f1, f2, block, unseen=reference.unseen(block), **rule)
         now = time.perf_counter()
         if progress is not None:
             progress(now - start, verdict)

@@ -19,7 +19,7 @@ import numpy as np
 from psdr_jit.core.film import require_samples
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
-from psdr_jit.derivative.statistics import GroupedImages, block_means, standard_error
+from psdr_jit.derivative.statistics import GroupedImages, Unseen, block_means, standard_error
 from psdr_jit.errors import OptionError
 from psdr_jit.scene.curve_ends import pad_curves
 
@@ -95,6 +95,10 @@ class CentralDifference:
         halves = np.concatenate([half.group_means() for half in self.halves])
         seen = standard_error(block_means(halves, block)) > rounding
         return np.where(seen, rounding, np.hypot(rounding, one_sample))
+
+    def unseen(self, block: int) -> Unseen:
+        """Errors of block means that the scatter between seeds does not show."""
+        return Unseen(self.floor(block), self.rare(block))
 
     def rare(self, block: int) -> np.ndarray:
         """What one event more or less, a sample that an edge passes over, changes of block means (h, w, C).

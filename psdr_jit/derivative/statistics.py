@@ -131,15 +131,22 @@ class BlockTest:
     z: np.ndarray    # (h, w, C), 0 where both images vanish
 
 
-def block_test(d: np.ndarray, f: np.ndarray, block: int,
-               floor: float | np.ndarray = 0.0, rare: float | np.ndarray = 0.0) -> BlockTest:
+@dataclass(frozen=True)
+class Unseen:
+    """Errors of block means (h, w, C) that the scatter between groups does not show."""
+
+    floor: float | np.ndarray = 0.0
+    rare: float | np.ndarray = 0.0  # what one event changes: where few have occurred, scatter may be far too small
+
+
+def block_test(d: np.ndarray, f: np.ndarray, block: int, unseen: Unseen = Unseen()) -> BlockTest:
     """z = (mean d - mean f) / sqrt(se_d^2 + se_f^2 + floor^2) for each block of pixels and channel.
 
-    `d`, `f`: group means (G, H, W, C). `floor` (h, w, C) is an error that the scatter between groups does not
-    show; blocks whose measured error lies below it count towards max_z only, since the root mean
-    square of their z says nothing. `rare` (h, w, C) is what one event changes: where few have occurred, the scatter may
-    be far too small. It counts as an error of blocks that are off by more than `SURPRISING`.
+    `d`, `f`: group means (G, H, W, C). Blocks whose measured error lies below `unseen.floor` count towards max_z only,
+    since the root mean square of their z says nothing. `unseen.rare` counts as an error of blocks that are off by more
+    than `SURPRISING`.
     """
+    floor, rare = unseen.floor, unseen.rare
     d, f = block_means(d, block), block_means(f, block)
     variance = standard_error(d) ** 2 + standard_error(f) ** 2
     difference = d.mean(0) - f.mean(0)

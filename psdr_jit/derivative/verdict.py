@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psdr_jit.derivative.statistics import BlockTest, Gain, GroupedImages, block_means, block_test, gain
+from psdr_jit.derivative.statistics import BlockTest, Gain, GroupedImages, Unseen, block_means, block_test, gain
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 
@@ -36,16 +36,15 @@ class Verdict:
 
 
 def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *, tolerance: float = 0.02,
-          max_stderr: float = 0.007, zero_bound: float | None = None,
-          floor: float | np.ndarray = 0.0, rare: float | np.ndarray = 0.0) -> Verdict:
+          max_stderr: float = 0.007, zero_bound: float | None = None, unseen: Unseen = Unseen()) -> Verdict:
     """Apply the pass rule to images collected so far; `inconclusive` when more seeds could still decide.
 
     `zero_bound`: for a gradient that ought to vanish, the largest block mean [radiance per unit] accepted.
-    `floor`, `rare`: errors of block means that no scatter shows, see `block_test`.
+    `unseen`: errors that no scatter shows, see `block_test`.
     """
     slope = gain(d.group_means(), f1.group_means(), f2.group_means())
     halves = np.concatenate((f1.group_means(), f2.group_means()))
-    test = block_test(d.group_means(), halves, block, floor, rare)
+    test = block_test(d.group_means(), halves, block, unseen)
     decision, reason = _decide(slope, test, (d, f1, f2), block, _Rule(tolerance, max_stderr, zero_bound))
     return Verdict(decision, reason, slope.value, slope.stderr, test.rms_z, test.max_z, test.blocks)
 

@@ -30,18 +30,15 @@ from ..plan.motion import Motion, SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
-from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.checks import require_supported
-from ..scene.clipping import warn_about_clipping
 from ..scene.facts import SceneFacts, analyse
 from ..scene.mesh_tables import CallVariables
-from ..scene.painted_lights import warn_about_painted_lights
-from ..scene.stale_values import warn_about_stale_values
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
 from .noise_log import NoiseLog
 from .pilot import Measurement
 from .terms import TERMS
+from .warn_about import warn_about
 
 #: Why a term that is needed may be left out by a given plan all the same.
 MAY_BE_OUT = (SWITCHED_OFF, NO_EDGES)
@@ -116,13 +113,7 @@ def prepare(call: Call) -> Prepared:
     require_runtime(call.seed, max(budgets.values()) * int(film.crop_size()[0]) * int(film.crop_size()[1]))
     facts = _facts(call)
     require_supported(facts, call.memory)
-    warn_about_painted_lights(call.scene, facts, call.memory)
-    if call.options.hide_emitters:
-        warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
-    if facts.geometry_moves:
-        warn_about_clipping(call.scene, call.sensor, facts, call.memory)
-    if call.mode == "backward":
-        warn_about_stale_values(call.scene, facts, call.memory)
+    warn_about(call, facts)
     question = _Question(call, facts, budgets, Memory())
     plan, log = _plan(question) if given is None else (_as_given(given, question), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)

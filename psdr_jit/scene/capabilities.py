@@ -154,8 +154,8 @@ SUPPORT = (
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
-        "a bump map's slopes step at edges; where bent normals turn from the viewer is none: up to 8 % (steep maps all "
-        "over a ball)"),
+        "a bump map's slopes step at edges; where bent normals turn from the viewer is none: up to 8 % with steep maps "
+        "all over a ball, more where the sensor sees steep ones aslant: warning"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),

@@ -12,7 +12,7 @@ from variants import activate
 from psdr_jit.derivative.check import check_gradient
 from psdr_jit.derivative.finite_differences import CentralDifference
 from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.derivative.statistics import GroupedImages, block_means, block_test, gain
+from psdr_jit.derivative.statistics import GroupedImages, Unseen, block_means, block_test, gain
 from psdr_jit.derivative.verdict import FAIL, INCONCLUSIVE, PASS, judge
 from psdr_jit.errors import UnsupportedError
 from psdr_jit.scene import io as scene_io
@@ -130,7 +130,7 @@ def test_what_few_events_show_is_uncertain(events):
     f = rng.poisson(events / groups, small[0].shape) * groups / events + small[0]
     for truth, right in ((1, True), (0, events < 10)):
         d, one = truth + small[1], 1 / events
-        assert (block_test(d, f, 1, rare=one).max_z < 6) == right
+        assert (block_test(d, f, 1, Unseen(rare=one)).max_z < 6) == right
     assert events > 10 or block_test(1 + small[1], f, 1).max_z > 30
 
 

@@ -129,7 +129,7 @@ def test_without_caustics_nothing_changes(llvm, name):
     limits = {"max_depth": 3}
     path, ours = (np.array(mi.render(scene, integrator=mi.load_dict({"type": t, **limits}), spp=4, seed=5))
                   for t in ("path", "psdr_bdpt"))  # fmt: skip
-    assert np.array_equal(path, ours)
+    assert np.allclose(path, ours, rtol=1e-5, atol=1e-6)  # threads add to the film in any order
     name = next(key for key in mi.traverse(scene).keys() if key.endswith(("reflectance.value", "to_world")))
     motion = perturb(scene, name, X) if name.endswith("to_world") else perturb(scene, name)
     a, b = (forward(motion, {"type": t, **limits}, 2, 4) for t in ("psdr_path", "psdr_bdpt"))
@@ -170,7 +170,7 @@ def test_same_flow_however_found(llvm, form):
     scene = glass_scene(alpha=0.5)
     motion = perturb(scene, "camera.to_world", X)
     budgets = dict(max_depth=4, form=form, sppc=1, sppp=0, sppi=0)
-    spp = {"spatial": 256, "material": 1024}[form]
+    spp = {"spatial": 2048, "material": 1024}[form]  # at outlines the spatial form has far outliers
     by_camera, by_light = (forward(motion, bdpt(how, **budgets), SEEDS, spp) for how in ("off", "only"))
     assert_grad_close(by_light, by_camera, max_stderr=0.06)
 

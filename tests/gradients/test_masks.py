@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import assert_grad_close, forward
+from helpers import forward
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
@@ -64,4 +64,5 @@ def test_a_shadow_behind_a_mask(llvm):
         return forward(perturb(scene, "block.vertex_positions", direction=(1, 0.3, 0.2)), SPEC, SEEDS, SPP)
 
     pane = {"type": "rectangle", "to_world": T().translate([0, 0, 3]).scale(0.3)}
-    assert_grad_close(2 * moved(pane={**pane, "bsdf": half(BLACK)}), moved(), max_stderr=0.02)
+    seen, plain = moved(pane={**pane, "bsdf": half(BLACK)}).mean(0), moved().mean(0)
+    assert np.linalg.norm(2 * seen - plain) < 0.01 * np.linalg.norm(plain)  # noise is far below what rays are lifted by

@@ -1,0 +1,76 @@
+"""Bent normals that turn from the sensor: where they begin to, what a bump or normal map sends there steps.
+
+Mitsuba then turns them over (`flip_invalid_normals`), or the nested BSDF ends. No edge stands for the curves within
+texels at which that begins. Maps that are steep for how they are looked at are named.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.memory import Memory, Slot
+from ..core.sensor_frame import sensor_frame
+from ..core.warn_once import warn_once
+from ..errors import UnsupportedWarning
+from .delta_lobes import BENT_NORMALS
+from .facts import SceneFacts
+from .graph import child_objects, plugin_name
+from .sight_lines import first_hits, is_time, lines_of_sight
+
+#: Share of what is seen of a shape that may be turned away. With 2 %, the derivative of a turning sheet was 7 % off.
+TURNED_SHARE = 0.003
+
+#: Of an integrator: calls so far.
+CALLS: Slot[int] = Slot(int)
+
+
+def warn_about_bent_normals(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
+    """Name shapes of which the sensor sees many points whose bent normals turn from it, once each."""
+    bent = {s.index: maps for s in facts.shapes if s.index >= 0 and (maps := _maps(scene.shapes()[s.index].bsdf()))}
+    if not bent or not is_time(sensor, memory, CALLS):
+        return
+    o, d, _, _ = lines_of_sight(scene, sensor_frame(sensor))
+    ray, pi, number = first_hits(scene, o, d)
+    for index, maps in bent.items():
+        met = number == index + 1
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, met)
+        share = max(_turned_share(si, node, met) for node in maps)
+        if share > TURNED_SHARE:
+            name = next(s.name for s in facts.shapes if s.index == index)
+            warn_once(
+                f"the {plugin_name(maps[0])} of shape '{name}' turns normals from the sensor on {share:.0%} of what is "
+                "seen of it: where they begin to, the image steps, and this part of the derivative is missing; use a "
+                "map that is less steep",
+                UnsupportedWarning, memory,
+            )  # fmt: skip
+
+
+def _maps(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
+    """The bump and normal maps below a BSDF."""
+    if not isinstance(bsdf, mi.BSDF):
+        return []
+    own = [bsdf] if plugin_name(bsdf) in BENT_NORMALS else []
+    return own + [found for child in child_objects(bsdf) for found in _maps(child)]
+
+
+def _turned_share(si: mi.SurfaceInteraction3f, node: mi.BSDF, met: mi.Bool) -> float:
+    """Share of the points `met` at which the normal that `node` bends is turned from the viewer."""
+    n = _bent(si, node, met)
+    towards = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))  # of two-sided surfaces, the side that is seen
+    turned = met & (dr.dot(n, towards) <= 0)
+    seen, away = (float(np.array(dr.count(mask)).ravel()[0]) for mask in (met, turned))
+    return away / seen if seen else 0.0
+
+
+def _bent(si: mi.SurfaceInteraction3f, node: mi.BSDF, met: mi.Bool) -> mi.Normal3f:
+    """The bent normal in the shading frame, before Mitsuba turns it [Mitsuba 3.9.1, `bumpmap.cpp`, `normalmap.cpp`]."""
+    texture = next(child for child in child_objects(node) if isinstance(child, mi.Texture))
+    if plugin_name(node) == "normalmap":
+        return mi.Normal3f(dr.normalize(2 * mi.Vector3f(texture.eval_3(si, met)) - 1))
+    slope = mi.traverse(node)["scale"] * texture.eval_1_grad(si, met)
+    n = si.sh_frame.n
+    across = dr.cross(si.dp_du + n * (slope.x - dr.dot(n, si.dp_du)), si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv)))
+    across *= dr.select(dr.dot(si.n, across) < 0, -1.0, 1.0)
+    return mi.Normal3f(si.to_local(dr.normalize(across)))
