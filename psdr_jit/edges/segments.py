@@ -49,8 +49,13 @@ class MeshTopology:
     device: EdgeTopologyDevice
     shell: mi.Float  # per edge, see EdgeRows
     facing: mi.Float  # per face, the shell of its surface
+    kept: mi.Bool  # per face: has it an area, and repeats none before it?
     parts: tuple[Part, ...]  # connected surfaces, if there are several
     place: mi.Float | None = None  # the vertices for which it was last found to hold, kept alive likewise
+
+    @property
+    def keeps_all(self) -> bool:
+        return self.host.duplicate_faces == self.host.degenerate_faces == 0
 
 
 #: By mesh and its numbers of vertices and faces.
@@ -130,7 +135,9 @@ def _cached_topology(mesh: mi.Mesh, memory: Memory) -> MeshTopology:
     facing = np.zeros(len(f), np.float32)
     facing[topology.f0] = shell
     facing[topology.f1[~topology.border]] = shell[~topology.border]
-    shells = [uploaded(mi.Float, column) for column in (shell, facing)]
+    kept = np.zeros(len(f), bool)
+    kept[topology.f0] = kept[topology.f1[~topology.border]] = True
+    shells = [uploaded(kind, column) for kind, column in ((mi.Float, shell), (mi.Float, facing), (mi.Bool, kept))]
     known = MeshTopology(faces_buffer(mesh), topology, upload_topology(topology), *shells, parts_of(topology, f))
     memory[TOPOLOGIES][key] = known
     _still_holds(known, mesh)  # true: its kernels are compiled now, not in the next call

@@ -62,14 +62,17 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
     if not chosen:
         return None
     shape, prim = by_face(chosen)
+    topologies = [known_topology(mesh, memory) for mesh in chosen]
     place = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(places)), shape)
     rows = FaceRows(
         corner=joined_faces(chosen),
         shape=shape,
         prim=prim,
-        shell=joined([known_topology(mesh, memory).facing for mesh in chosen]) * dr.gather(mi.Float, outside, place),
+        shell=joined([topology.facing for topology in topologies]) * dr.gather(mi.Float, outside, place),
         moves=dr.gather(mi.Bool, uploaded(mi.Bool, np.array(moving)), place),
     )
+    if not all(topology.keeps_all for topology in topologies):  # what rays may meet at one place is there once
+        rows = dr.gather(FaceRows, rows, dr.compress(joined([topology.kept for topology in topologies])))
     shapes = pointers(mi.ShapePtr, chosen)
     found = SmoothFaces(
         tuple(chosen), shapes, rows, dr.detach(attached_positions(tuple(chosen))), dr.detach(_normals(tuple(chosen)))

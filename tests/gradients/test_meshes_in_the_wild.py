@@ -138,3 +138,25 @@ def test_a_mesh_that_is_mirrored_between_two_calls(llvm):
     fresh = derivative(build(fixed))
     assert np.abs(fresh).max() > 0.1
     assert np.allclose(derivative(used), fresh, rtol=1e-4, atol=1e-4 * np.abs(fresh).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("painted", [False, True])
+def test_faces_that_repeat_others_are_there_once(llvm, painted):
+    """Outlines by shading normals, and lines of patterns, on them counted twice."""
+    checkers = {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale(7)}
+    points, faces = meshes.ball(12, 24)
+    points = (points - meshes.CENTRE) / meshes.RADIUS
+    bsdf = mi.load_dict({"type": "diffuse", "reflectance": checkers if painted else 0.7})
+    images = []
+    for repeats in (1, 2):  # of all: normals that Mitsuba computes are means over the faces, repeated ones as well
+        mesh = meshes.smooth_mesh("ball", points, np.concatenate([faces] * repeats), bsdf)
+        if painted:
+            mesh.add_attribute("vertex_texcoords", 2, (points[:, :2] / 2 + 0.503).ravel())
+        film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+        pose = mi.ScalarTransform4f().look_at([0.3, 1.1, 4], [0, 0, 0], [0, 1, 0])
+        sensor = {"type": "perspective", "fov": 35, "to_world": pose, "film": film}
+        lamp = {"type": "point", "position": [2, 3, 3], "intensity": 20.0}
+        scene = mi.load_dict({"type": "scene", "sensor": sensor, "ball": mesh, "lamp": lamp}, optimize=False)
+        images.append(forward(perturb(scene, "sensor.to_world", (1, 0.3, 0.2)), SPEC, 8, 1024).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.01 * np.linalg.norm(images[0])
