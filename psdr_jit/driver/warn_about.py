@@ -8,6 +8,7 @@ from ..scene.bent_away import warn_about_bent_normals
 from ..scene.clipping import warn_about_clipping
 from ..scene.facts import SceneFacts
 from ..scene.painted_lights import warn_about_painted_lights
+from ..scene.sight_lines import is_time
 from ..scene.stale_values import warn_about_stale_values
 
 
@@ -16,7 +17,7 @@ def warn_about(call: Call, facts: SceneFacts) -> None:
     warn_about_painted_lights(call.scene, facts, call.memory)
     if call.options.hide_emitters:
         warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
-    if facts.geometry_moves:
+    if facts.geometry_moves and is_time(call.sensor, call.memory):
         warn_about_clipping(call.scene, call.sensor, facts, call.memory)
         warn_about_bent_normals(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":

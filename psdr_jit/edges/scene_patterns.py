@@ -216,23 +216,23 @@ def _seen_sides(
     faces that repeat others.
     """
     lower, upper = origin_box(job.frame)
-    fronts, shells, kept, firsts, first, all_kept = [], [], [], [], 0, True
-    for facts, patterns in zip(chosen, found, strict=True):
-        shape = edge_shapes(job).shapes[facts.index]
+    shapes, fronts, shells, firsts, first = edge_shapes(job).shapes, [], [], [], 0
+    topologies = [known_topology(shapes[s.index], job.call.memory) if s.is_mesh else None for s in chosen]
+    for facts, patterns, topology in zip(chosen, found, topologies, strict=True):
+        shape = shapes[facts.index]
         outside = float(facts.opaque and apart(lower, upper, shape.bbox()))
         one_sided = facts.is_mesh and not facts.smooth and not facts.bsdf_flags & int(mi.BSDFFlags.BackSide)
         fronts.append(patterns.front if one_sided and patterns is not None else 0.0)
-        topology = known_topology(shape, job.call.memory) if facts.is_mesh else None
         shells.append(outside * (topology.facing if topology else mi.Float(facts.plugin == "sphere")))
-        kept.append(topology.kept if topology else mi.Bool(True))
-        all_kept &= topology is None or topology.keeps_all
         firsts.append(first)
         first += facts.faces if facts.is_mesh else 1
     rows, are_meshes = lines.rows, any(facts.is_mesh for facts in chosen)
     face = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(firsts)), rows.shape)
     part = face + rows.part if are_meshes else face
     closed = dr.gather(mi.Float, joined(shells), part)
-    there = mi.Bool(True) if all_kept else dr.gather(mi.Bool, joined(kept), part)
+    there = mi.Bool(True)
+    if not all(topology is None or topology.keeps_all for topology in topologies):
+        there = dr.gather(mi.Bool, joined([t.kept if t else mi.Bool(True) for t in topologies]), part)
     side = dr.gather(mi.Float, uploaded(mi.Float, np.array(fronts)), rows.shape)
     front = dr.select((closed < 0) | (side < 0) | ~there, mi.Float(0), 1)
     return front, dr.select((closed > 0) | (side > 0) | ~there, mi.Float(0), 1)

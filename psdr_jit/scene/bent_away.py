@@ -10,14 +10,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory
 from ..core.sensor_frame import sensor_frame
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .delta_lobes import BENT_NORMALS
 from .facts import SceneFacts
 from .graph import child_objects, plugin_name
-from .sight_lines import first_hits, is_time, lines_of_sight
+from .sight_lines import first_hits, lines_of_sight
 
 #: Share of what is seen of a shape that may be turned away: a sheet with 2 % was 7 % off, a ball with 1 % was right.
 TURNED_SHARE = 0.015
@@ -25,27 +25,24 @@ TURNED_SHARE = 0.015
 #: Cosine of the view below which all surfaces, round ones at their rims, show little of themselves.
 SLANTED = 0.25
 
-#: Of an integrator: calls so far.
-CALLS: Slot[int] = Slot(int)
-
 
 def warn_about_bent_normals(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Name shapes of which the sensor sees many points whose bent normals turn from it, once each."""
-    bent = {s.index: maps for s in facts.shapes if s.index >= 0 and (maps := _maps(scene.shapes()[s.index].bsdf()))}
-    if not bent or not is_time(sensor, memory, CALLS):
+    shapes = scene.shapes()
+    bent = [(s, maps) for s in facts.shapes if s.index >= 0 and (maps := _maps(shapes[s.index].bsdf()))]
+    if not bent:
         return
     o, d, _, _ = lines_of_sight(scene, sensor_frame(sensor))
     ray, pi, number = first_hits(scene, o, d)
-    for index, maps in bent.items():
-        met = number == index + 1
+    for shape, maps in bent:
+        met = number == shape.index + 1
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, met)
         share = max(_turned_share(si, node, met) for node in maps)
         if share > TURNED_SHARE:
-            name = next(s.name for s in facts.shapes if s.index == index)
             warn_once(
-                f"the {plugin_name(maps[0])} of shape '{name}' turns normals from the sensor on {share:.0%} of what is "
-                "seen of it: where they begin to, the image steps, and this part of the derivative is missing; use a "
-                "map that is less steep",
+                f"the {plugin_name(maps[0])} of shape '{shape.name}' turns normals from the sensor on {share:.0%} of "
+                "what is seen of it: where they begin to, the image steps, and this part of the derivative is missing; "
+                "use a map that is less steep",
                 UnsupportedWarning, memory,
             )  # fmt: skip
 

@@ -9,21 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.memory import Memory, Slot
+from ..core.memory import Memory
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from .facts import SceneFacts
-from .sight_lines import GRID, first_hits, is_time, lines_of_sight
-
-#: Of an integrator: calls so far.
-CALLS: Slot[int] = Slot(int)
+from .sight_lines import GRID, first_hits, lines_of_sight
 
 
 def warn_about_clipping(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Warn once where neighbouring camera rays meet the same shape before and behind a clipping plane."""
-    if not is_time(sensor, memory, CALLS):
-        return
     for name, shape in _cut(scene, sensor):
         known = next((f"'{s.name}'" for s in facts.shapes if s.index == shape), "a shape")
         warn_once(

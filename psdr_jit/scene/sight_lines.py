@@ -16,17 +16,18 @@ GRID = 64  # camera rays along each side of the film
 
 EVERY = 16  # calls: things move while parameters are optimised
 
+#: Of an integrator: calls so far.
+CALLS: Slot[int] = Slot(int)
 
-def is_time(sensor: mi.Sensor, memory: Memory, calls: Slot[int]) -> bool:
-    """Is this the first of `EVERY` calls, which `calls` counts, and can the sensor's lines of sight be drawn?"""
-    memory[calls] += 1
+
+def is_time(sensor: mi.Sensor, memory: Memory) -> bool:
+    """Is this the first of `EVERY` calls, and can the sensor's lines of sight be drawn? Counts the calls."""
+    memory[CALLS] += 1
     known = sensor.class_name() in KINDS and not dr.flag(dr.JitFlag.FreezingScope)
-    return known and memory[calls] % EVERY == 1
+    return known and memory[CALLS] % EVERY == 1
 
 
-def lines_of_sight(
-    scene: mi.Scene, frame: SensorFrame
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
+def lines_of_sight(scene: mi.Scene, frame: SensorFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
     """`(points on the near plane, unit directions, way back from there to before all that a plane may hide, planes)`,
     (N, 3), (N, 3), (N, 1) and numbers, world space, through the middles of the cells of a grid on the film.
 
