@@ -56,13 +56,14 @@ def empty_stack() -> Stack:
 
 def push(stack: Stack, height: mi.UInt32, at: Interval, active: mi.Bool) -> mi.UInt32:
     """The height afterwards."""
-    fresh = dr.select(at.fresh, mi.Float(1), 0)
-    for store, value in zip(stack, (mi.Vector4f(at.lo, at.hi, at.weight, fresh), at.key), strict=True):
+    marks = dr.select(at.fresh, mi.Float(1), 0) + dr.select(at.uneven, mi.Float(2), 0)
+    for store, value in zip(stack, (mi.Vector4f(at.lo, at.hi, at.weight, marks), at.key), strict=True):
         store.write(value, dr.select(active, height, SLOTS))
     return height + dr.select(active, mi.UInt32(1), 0)
 
 
 def read(stack: Stack, i: mi.UInt32, sample: mi.UInt32) -> Interval:
     """Number `i`, from the bottom; all are of the line `sample`."""
-    (lo, hi, weight, fresh), key = (store.read(i) for store in stack)
-    return Interval(sample, lo, hi, weight, key, fresh != 0)
+    (lo, hi, weight, marks), key = (store.read(i) for store in stack)
+    fresh = (marks == 1) | (marks == 3)
+    return Interval(sample, lo, hi, weight, key, fresh, marks >= 2)

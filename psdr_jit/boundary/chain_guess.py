@@ -2,10 +2,10 @@
 
 From the one to the other the last lines of sight change almost evenly, and so does what tells on which side of a curve
 they pass: of a side A B of a triangle d·((B − A) × (o − A)), of the contour of a sphere or tube and of the rim of a
-disk the distance, of two planes the difference of their distances along the line, of a shading outline n·d. Where such
-a function changes its sign, its zero is guessed at on a straight line. A surface that ends does so at the curve that
-is crossed first, from the hit; the nearer of the two is looked at before the other. A wrong guess costs the search a
-comparison (`chain_search`), no more.
+disk the distance, of two planes the difference of their distances along the line, of a shading outline n·d, of the
+choice of a lobe the number that chooses, less the probability of the first. Where such a function changes its sign, its
+zero is guessed at on a straight line. A surface that ends does so at the curve that is crossed first, from the hit; the
+nearer of the two is looked at before the other. A wrong guess costs the search a comparison (`chain_search`), no more.
 """
 
 from __future__ import annotations
@@ -77,8 +77,7 @@ class Guesses:
 
     def where(self, pair: Pair, active: mi.Bool) -> mi.Float:
         """Share of the way from a to b, or `NOWHERE`. Detached."""
-        active = active & ~pair.chosen
-        outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon & ~pair.turned
+        outlined = active & (pair.family == NO_FAMILY) & ~pair.horizon & ~pair.turned & ~pair.chosen
         first = pair.a.intersection().t <= pair.b.intersection().t
         near, far = dr.select(first, pair.a, pair.b), dr.select(first, pair.b, pair.a)
         of_near, of_far = (triangle(self.copies, hit, outlined) for hit in (near, far))

@@ -109,6 +109,17 @@ def leave(
     return Leaving(ray, factor, alive, onward.alive, onward.through, onward.probability, onward.rest)
 
 
+def lobes_part(onward: tuple[Leaving, Leaving], numbers: tuple[mi.Float, mi.Float]) -> tuple[mi.Bool, mi.Float]:
+    """Do two chains leave by different delta lobes, and at which share of the way from the one to the other does the
+    choice change, roughly? `numbers`: those that chose, of which the reflected lobe has the lowest."""
+    a, b = onward
+    past_a, past_b = (
+        u - dr.select(leaving.through, 1 - leaving.probability, leaving.probability)
+        for leaving, u in zip(onward, numbers, strict=True)
+    )
+    return a.by_delta & b.by_delta & (a.through != b.through), past_a / (past_a - past_b)
+
+
 def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
     """`(does it reflect, does it let through)` by a delta lobe."""
     flags = bsdf.flags()

@@ -95,7 +95,7 @@ class Search:
         lamp = ~checks & (pair.miss < NEAR) & (dr.abs(pair.lamp - 0.5) < WITHIN)
         half = self.at.half(dr.select(probes, self.guess, self.at.middle()))
         part = dr.select(self.mode == LOOK, self.at, half)
-        part.fresh = checks | (probes & half.fresh)
+        part.fresh, part.uneven = (checks | (probes & mark) for mark in (half.fresh, half.uneven))
         kept, part = part.kept(pair.specular | checks, lamp, narrowest)
         return kept, part, dr.select(lamp, dr.lerp(start, end, pair.lamp), part.middle())
 
@@ -136,9 +136,9 @@ def _searched(
         again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
         crossed = checked & pair.differs & ~again
 
-        found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh), pair.k)
+        found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh, at.uneven), pair.k)
         finds.write(slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
-        front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, pair.chosen)
+        front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, pair.chosen, ~moves)
         kept, part = front.kept(mi.Bool(True), mi.Bool(False), narrowest)
         finds.write_front(slot, part, crossed & kept & before_halving)
         height = push(stack, height, part, crossed & kept & ~before_halving)
@@ -147,7 +147,7 @@ def _searched(
         kept, part, place = search.looked_into(pair, (start, end), narrowest)
         halved = apart | halve | again
         narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
-        behind = at.part(hi, at.hi, BEHIND, mi.Bool(True))
+        behind = at.part(hi, at.hi, BEHIND, mi.Bool(True), mi.Bool(False))
         at = dr.select(halved, at, dr.select(crossed, behind, part))
         ends = ~halved & ~crossed & ~kept
         returns = ends & (height > 0)

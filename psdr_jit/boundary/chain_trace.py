@@ -28,7 +28,7 @@ from ..scene.surfaces import Surfaces
 from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
 from .chain_lamps import ChainLamps
-from .chain_lobes import Leaving, LobeNumber, has_delta, leave, smooth_choice
+from .chain_lobes import Leaving, LobeNumber, has_delta, leave, lobes_part, smooth_choice
 from .chain_patterns import NO_FAMILY, ChainPatterns
 from .chain_surface import NOWHERE, ChainSurfaces, goes_under
 
@@ -243,9 +243,9 @@ def trace_pair(
         lobe_a, lobe_b = lobe_a.or_fresh(u.lobe.y), lobe_b.or_fresh(u.lobe.y)
         on_a = leave(a, pair.k, mi.Point2f(u.lobe.x, lobe_a.u), direction, active, ctx)
         on_b = leave(b, pair.k, mi.Point2f(u.lobe.x, lobe_b.u), direction, active, ctx)
+        pair.chosen, place = lobes_part((on_a, on_b), (lobe_a.u, lobe_b.u))
+        pair.differs, pair.where = pair.differs | pair.chosen, dr.select(pair.chosen, place, pair.where)
         lobe_a, lobe_b = lobe_a.behind(on_a, active), lobe_b.behind(on_b, active)
-        pair.chosen = on_a.by_delta & on_b.by_delta & (on_a.through != on_b.through)
-        pair.differs |= pair.chosen
         if dr.hint(store is not None, mode="scalar"):
             store.write_bend(pair.k, on_a.by_delta, active)
         active = on_a.alive & on_b.alive & ~pair.chosen
