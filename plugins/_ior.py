@@ -8,14 +8,19 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from psdr_jit.errors import ParameterError, UnsupportedError
+
+#: What the defaults are, of either plugin [Mitsuba 3.9.1, `include/mitsuba/render/ior.h`].
+DEFAULTS = {"air": 1.000277, "bk7": 1.5046, "polypropylene": 1.49}
 
 
 def read_eta(props: mi.Properties, int_ior: str) -> mi.Float:
     """η = int_ior / ext_ior of a plugin, each a number or the name of a material; inside: `int_ior` by default.
 
-    Mitsuba knows the names: it is asked for a `dielectric` with the same two.
+    Mitsuba knows the names: of others than the defaults it is asked for a `dielectric` with the same two. What loads
+    something else while Mitsuba loads the parts of a scene file side by side now and then makes it fail.
     """
     if mi.is_polarized:
         raise UnsupportedError(
@@ -25,11 +30,14 @@ def read_eta(props: mi.Properties, int_ior: str) -> mi.Float:
     given = {"int_ior": props.get("int_ior", int_ior), "ext_ior": props.get("ext_ior", "air")}
     for name, value in given.items():
         if isinstance(value, str):
+            given[name] = DEFAULTS.get(value, value)
             continue
         if not value > 0:
             raise ParameterError(f"{name} = {value}: an index of refraction is positive")
         given[name] = float(value)
-    return opaque(mi.Float(mi.traverse(mi.load_dict({"type": "dielectric", **given}))["eta"]))
+    if any(isinstance(value, str) for value in given.values()):
+        return opaque(mi.Float(mi.traverse(mi.load_dict({"type": "dielectric", **given}))["eta"]))
+    return opaque(mi.Float(np.float32(given["int_ior"]) / np.float32(given["ext_ior"])))
 
 
 def opaque(value: mi.Float) -> mi.Float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
@@ -43,12 +45,14 @@ class TermIntegrator(ADIntegrator):
         self.aovs = AovChannels(self.options)
         self.counters = Counters()
         self.stats = {"rejected": self.counters.rejected, "grazing": self.counters.grazing}  # dropped, or cut short
-        path_options = {
-            "max_depth": self.options.max_depth,
-            "rr_depth": self.options.rr_depth,
-            "hide_emitters": self.options.hide_emitters,
-        }
-        self._images = {name: mi.load_dict({"type": name, **path_options}) for name in ("path", "prb")}
+
+    @cached_property
+    def _images(self) -> dict[str, mi.Integrator]:
+        """Mitsuba's own, which make the image. Not made with the plugin: Mitsuba loads the parts of a scene file side
+        by side, and one that loads others meanwhile now and then makes it fail."""
+        options = self.options
+        depths = {"max_depth": options.max_depth, "rr_depth": options.rr_depth, "hide_emitters": options.hide_emitters}
+        return {name: mi.load_dict({"type": name, **depths}) for name in ("path", "prb")}
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         require_integrator(self)

@@ -20,9 +20,15 @@ from __future__ import annotations
 
 __version__ = "0.1.0"
 
+from pathlib import Path as _Path
+
 from .setup.drjit_libraries import mitsuba_can_load as _mitsuba_can_load
 from .setup.llvm import apply_saved_choice as _apply_saved_choice
 from .setup.quick_compile import apply_if_asked as _compile_quickly_if_asked
+
+_here = _Path(__file__).parent
+if not (_here / "plugins").exists():  # in a clone, whose Python sees this folder first, they lie beside it
+    __path__.append(str(_here.parent))
 
 _apply_saved_choice()  # before drjit is loaded: it looks for libLLVM once
 _compile_quickly_if_asked()

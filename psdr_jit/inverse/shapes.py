@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 import drjit as dr
@@ -21,6 +22,9 @@ SAME_POINT = 1e-4
 
 #: Share of the median radius of a cross-section within which its points belong to the caps, and stay.
 INNER = 0.2
+
+#: What `mi.ad.LargeSteps` solves with.
+SOLVER = "cholespy"
 
 #: Waves around a cross-section that a perturbed start is made of.
 WAVES = 6
@@ -48,6 +52,14 @@ class Vertices:
     _own: np.ndarray = field(default=None, init=False, repr=False)
     _steps: Any = field(default=None, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        """Says what is missing before scenes are loaded and targets rendered."""
+        if self.smoothness > 0 and find_spec(SOLVER) is None:
+            raise SetupError(
+                f"'{self.parameter}': smooth steps need the package '{SOLVER}': pip install {SOLVER}, or set "
+                "smoothness = 0"
+            )
+
     @property
     def learning_rates(self) -> dict[str, float]:
         return {"u": self.learning_rate}
@@ -62,13 +74,7 @@ class Vertices:
         self._own = numbers(positions)
         if self.smoothness > 0:
             faces = mi.UInt32(params[self.parameter[: -len(VERTEX_POSITIONS)] + "faces"])
-            try:
-                self._steps = mi.ad.LargeSteps(positions, faces, self.smoothness)
-            except ImportError as error:
-                raise SetupError(
-                    f"'{self.parameter}': smooth steps need the package '{error.name}': pip install "
-                    f"{error.name}, or set smoothness = 0"
-                ) from error
+            self._steps = mi.ad.LargeSteps(positions, faces, self.smoothness)
         return {"u": self._latent(positions)}
 
     def _latent(self, positions: mi.Float) -> mi.Float:

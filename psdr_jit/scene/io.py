@@ -52,6 +52,8 @@ def load_scene(path: str | os.PathLike, **defaults: Any) -> Any:
     `defaults` override the file's `<default>` values. What Mitsuba cannot read becomes a `SceneError`.
     """
     path = Path(path)
+    if path.is_dir():
+        raise SceneError(f"'{path}' is a folder: give one of the scene files in it")
     if not path.is_file():
         raise SceneError(f"scene file '{path}' does not exist: check the path")
     if not os.access(path, os.R_OK):

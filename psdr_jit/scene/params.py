@@ -123,13 +123,21 @@ def parameter_value(params: Any, name: str) -> Any:
     return None if (value if kind is None else params.get_property(value, kind, node)) is None else params[name]
 
 
+def _is_no_place(name: str) -> bool:
+    return not name.endswith(("positions", "to_world"))
+
+
 def _suggestion(name: str, known: list[str]) -> str:
     last = name.rsplit(".", 1)[-1]
     own = [k for k in known if k.startswith(f"{name}.")]
     if own:  # an object was named, most likely to be moved
-        own.sort(key=lambda k: not k.endswith(("positions", "to_world")))
+        own.sort(key=_is_no_place)
         return "; of that object there are " + ", ".join(f"'{k}'" for k in own)
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    if "." not in name:  # an object again, misspelt
+        objects = difflib.get_close_matches(name, {k.rsplit(".", 1)[0] for k in known}, n=1)
+        of_it = [k for k in known if objects and k.startswith(f"{objects[0]}.")]
+        close = sorted(of_it, key=_is_no_place) or close
     close += [k for k in known if k.rsplit(".", 1)[-1] == last and k not in close]
     if not close:
         return f"; 'psdr params SCENE.xml' lists them ({MERGED})"

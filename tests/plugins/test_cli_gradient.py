@@ -108,6 +108,7 @@ def scene_with_mesh(mesh: str) -> str:
 
 def test_missing_scene(capsys):
     assert "nope.xml' does not exist" in refused(capsys, "gradient", "nope.xml", *MOVE)
+    assert "is a folder" in refused(capsys, "gradient", ".", *MOVE)
 
 
 @pytest.mark.parametrize("content", [b'<scene version="3.0.0"><shape type="obj">', bytes(range(256)), b""])

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit.boundary.chain_lobes import LEAST_LOBE, SPENT, Leaving, LobeNumber, leave
+from psdr_jit.boundary.chain_lobes import LEAST_LOBE, SPENT, Leaving, LobeNumber, leave, lobes_part
 
 ETA, NUMBERS = 1.5, 1000
 
@@ -72,3 +72,16 @@ def test_nothing_is_spent_where_there_is_no_choice(llvm):
     mirrored = leave_pane(even(), 0.3, True)
     number = LobeNumber.begin(even()).behind(mirrored, mi.Bool(True))
     assert np.allclose(number.u, even(), atol=1e-6) and np.array_equal(number.length, np.ones(NUMBERS))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_where_the_choice_changes_is_told(llvm, inside):
+    """Two close chains with one number: on a straight line between their reflectances it is where that is met."""
+    cos = (0.42, 0.4) if not inside else (0.78, 0.77)
+    ends = [leave_pane(even(), c, inside) for c in cos]
+    chosen, where = lobes_part(tuple(ends), (even(), even()))
+    F = [float(mi.fresnel(mi.Float(-c if inside else c), ETA)[0][0]) for c in cos]
+    edge = [LEAST_LOBE + (1 - 2 * LEAST_LOBE) * f for f in F]
+    chosen, where, u = np.array(chosen), np.array(where), np.array(even())
+    assert np.array_equal(chosen, (u > min(edge)) & (u < max(edge))) and chosen.any()
+    assert np.allclose(where[chosen], (u[chosen] - edge[0]) / (edge[1] - edge[0]), atol=1e-3)

@@ -76,6 +76,8 @@ def test_unknown_parameter_suggests_close_names(scene):
         find_param(scene, "box.vertex_position")
     with pytest.raises(ParameterError, match=r"panel\.emitter\.radiance\.value"):
         find_param(scene, "radiance.value")
+    with pytest.raises(ParameterError, match=r"did you mean 'box\.vertex_positions'"):  # what moves the object
+        find_param(scene, "bx")
     with pytest.raises(ParameterError, match=r"of that object there are 'box\.vertex_positions'"):
         find_param(scene, "box")
 
