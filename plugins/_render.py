@@ -49,7 +49,8 @@ class TermIntegrator(ADIntegrator):
     @cached_property
     def _images(self) -> dict[str, mi.Integrator]:
         """Mitsuba's own, which make the image. Not made with the plugin: Mitsuba loads the parts of a scene file side
-        by side, and one that loads others meanwhile now and then makes it fail."""
+        by side, and one that loads others meanwhile now and then makes it fail.
+        """
         options = self.options
         depths = {"max_depth": options.max_depth, "rr_depth": options.rr_depth, "hide_emitters": options.hide_emitters}
         return {name: mi.load_dict({"type": name, **depths}) for name in ("path", "prb")}

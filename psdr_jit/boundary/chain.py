@@ -62,8 +62,11 @@ NAME = "chain"
 #: mirrors show what scatters light there is 1.4 to 11 times less noise with 4 than with one.
 WALKS = 8
 
+#: Memory of what one walk brings: a colour.
+WALK_BYTES = 4 * 3
+
 #: Memory of one line: an interval, its comparison, its share of what is found, what its walks bring, its directions.
-BYTES = 256 + 2 * WALKS * 12 + CHAIN_DEPTH * Directions.BYTES
+BYTES = 256 + 2 * WALKS * WALK_BYTES + CHAIN_DEPTH * Directions.BYTES
 
 
 @dataclass

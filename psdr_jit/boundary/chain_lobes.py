@@ -111,7 +111,8 @@ def leave(
 
 def lobes_part(onward: tuple[Leaving, Leaving], numbers: tuple[mi.Float, mi.Float]) -> tuple[mi.Bool, mi.Float]:
     """Do two chains leave by different delta lobes, and at which share of the way from the one to the other does the
-    choice change, roughly? `numbers`: those that chose, of which the reflected lobe has the lowest."""
+    choice change, roughly? `numbers`: those that chose, of which the reflected lobe has the lowest.
+    """
     a, b = onward
     past_a, past_b = (
         u - dr.select(leaving.through, 1 - leaving.probability, leaving.probability)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
+from importlib import import_module
 from typing import Any
 
 import drjit as dr
@@ -54,11 +54,15 @@ class Vertices:
 
     def __post_init__(self) -> None:
         """Says what is missing before scenes are loaded and targets rendered."""
-        if self.smoothness > 0 and find_spec(SOLVER) is None:
+        if not self.smoothness > 0:
+            return
+        try:
+            import_module(SOLVER)
+        except ImportError as error:
             raise SetupError(
-                f"'{self.parameter}': smooth steps need the package '{SOLVER}': pip install {SOLVER}, or set "
-                "smoothness = 0"
-            )
+                f"'{self.parameter}': smooth steps need the package '{SOLVER}' ('{error.name}' is missing): pip "
+                f"install {SOLVER}, or set smoothness = 0"
+            ) from error
 
     @property
     def learning_rates(self) -> dict[str, float]:
