@@ -18,6 +18,19 @@ def no_scenes_left() -> Iterator[None]:
     gc.collect()
 
 
+@pytest.fixture
+def nothing_collected() -> Iterator[None]:
+    """For `dr.freeze`: Dr.Jit ends the process when a scene is collected while a function is recorded.
+
+    "enqueue_host_func(): this function cannot be recorded", thrown where Mitsuba releases Embree's scene; scenes that
+    wait in a cycle, that of an earlier test's exception for instance, are collected at any time.
+    """
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])
 def variant(request) -> str:
     """Every backend with RGB; for whatever runs on the device."""

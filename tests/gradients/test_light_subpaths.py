@@ -246,7 +246,7 @@ def test_points_behind_smooth_glass_are_warned_about(llvm):
         make_plan(glass_scene(glass="smooth"), "lamp.to_world", integrator={"type": "psdr_path", **QUICK})
 
 
-def test_a_frozen_function_renders(llvm):
+def test_a_frozen_function_renders(llvm, nothing_collected):
     """Nothing can be read there: the image is that of `path`."""
     scene = load(GLASS, res=16)
     path, ours = (mi.load_dict({"type": t, "max_depth": 4}) for t in ("path", "psdr_bdpt"))

@@ -10,6 +10,8 @@ from psdr_jit.errors import UnsupportedError
 RED = "red.reflectance.value"
 QUICK = {"type": "psdr_path", "max_depth": 2}
 
+pytestmark = pytest.mark.usefixtures("nothing_collected")
+
 
 @pytest.fixture
 def scene(llvm):

@@ -544,7 +544,7 @@ def test_analysis_is_cheap():
     assert np.median(samples) < 0.05  # about 4 ms on two quiet cores
 
 
-def test_analysis_works_while_a_function_is_being_frozen():
+def test_analysis_works_while_a_function_is_being_frozen(nothing_collected):
     scene = load(ball=BALL)
     enable(scene, "ball.to_world")
 
