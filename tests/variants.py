@@ -34,3 +34,8 @@ def activate(name: str) -> str:
 needs_meshes_without_faces = pytest.mark.skipif(
     IN_PLACE_OF_LLVM == "cuda", reason="OptiX ends the process over meshes without faces"
 )
+
+
+def also(*values: object) -> object:
+    """A case of the slow tests alone, in a list of `pytest.mark.parametrize`."""
+    return pytest.param(*values, marks=pytest.mark.slow)

@@ -44,7 +44,7 @@ CASES = {
 }
 
 
-SLOW = ("cube-up", "ball-up", "cube-turns", "cube-floor-turns", "tube-up")  # the same pieces as the others
+SLOW = ("cube-up", "ball-up", "cube-turns", "cube-floor-turns", "tube-up", "tube-turns")  # pieces of the others
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])

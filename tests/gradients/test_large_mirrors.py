@@ -72,7 +72,8 @@ def test_area_lights_need_no_such_help(llvm):
     scene = mi.load_dict({
         "type": "scene", "mirror": {"type": "rectangle", "bsdf": MIRROR},
         "card": {"type": "sphere", "radius": 0.1, "center": [0, 0, 1], "emitter": {"type": "area"}},
-        "camera": {"type": "perspective", "to_world": mi.ScalarTransform4f().translate([0, 0, 3])},
+        "camera": {"type": "perspective", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]),
+                   "film": {"type": "hdrfilm", "width": 16, "height": 16}},
     })  # fmt: skip
     plan = psdr_jit.make_plan(scene, ["card.to_world"], integrator=BDPT)
     assert not plan.light.runs and "nothing to aim at" in plan.light.reason

@@ -51,6 +51,7 @@ def check(ball: mi.Mesh, depth: int, motion: str, reference_spp: int, spp: int =
     assert_grad_close(forward(moved, spec(depth), SEEDS, spp), reference, max_stderr=0.05)
 
 
+@pytest.mark.slow
 def test_a_ball_that_mirrors_a_sky(llvm):
     """All that can be seen to move are outlines and rims; inside of the ball it is dark."""
     surface, depth = BSDFS["mirror"]

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import adjoint_identity, fd, forward
+from variants import also
 
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.paths.orbits import Orbit
@@ -102,7 +103,7 @@ PATHS = {"max_depth": 3}
 
 @pytest.mark.parametrize(
     ("material", "motion"),
-    [("dielectric", SEEN), *(pytest.param("conductor", m, marks=pytest.mark.slow) for m in (SEEN, MOVED))],
+    [also("dielectric", SEEN), also("conductor", SEEN), also("conductor", MOVED)],
 )
 def test_differences_agree(llvm, material, motion):
     """Directions that rest miss a hundredth of the first, which then is in samples too rare to be met here."""

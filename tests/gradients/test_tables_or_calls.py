@@ -15,13 +15,13 @@ SHIFT, TURN = {"direction": (1, 0.5, 0.2)}, {"rotate": (1, 1, 0)}
 #: Scene, parameter, its motion, and how long paths are; first what is looked at in every run, in one form.
 FAST = [
     ("cbox", "small-box.vertex_positions", SHIFT, 4), ("ball_shadow", "blocker.to_world", SHIFT, 3),
-    ("patterns", "ball.to_world", TURN, 2),
+    ("patterns", "floor.to_world", SHIFT, 2),
 ]  # fmt: skip
 SLOW = [
     ("cbox", "sensor.to_world", SHIFT, 3), ("cbox", "light.to_world", SHIFT, 3),
     ("ball_shadow", "floor.to_world", SHIFT, 3), ("smooth_ball_shadow", "blocker.vertex_positions", SHIFT, 3),
     ("smooth_ball_shadow", "blocker.vertex_positions", TURN, 3),
-    ("environment_shadow", "blocker.vertex_positions", SHIFT, 3), ("patterns", "floor.to_world", SHIFT, 2),
+    ("environment_shadow", "blocker.vertex_positions", SHIFT, 3), ("patterns", "ball.to_world", TURN, 2),
     ("glass", "body.to_world", SHIFT, 4), ("mirrors", "mirror.to_world", {"rotate": (1, 0, 0)}, 4),
     ("rough_glass", "ball.bsdf.eta", {}, 4), ("sunk_ball", "ball.to_world", SHIFT, 2),
 ]  # fmt: skip

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers import adjoint_identity, fd, forward
 from test_smooth_meshes import LIGHT, REFLECTOR, scene_of, sphere
+from variants import also
 
 from psdr_jit import make_plan
 from psdr_jit.derivative.perturbation import Perturbation, perturb
@@ -26,7 +27,10 @@ def leaning(kind: dict) -> Perturbation:
     return perturb(scene, NORMALS, np.tile(np.array([0.3, -0.4, 0.9], np.float32), count))
 
 
-@pytest.mark.parametrize("kind, spp, off", [(LIGHT, 4096, 0.9), (REFLECTOR, 1024, 0.02)], ids=["light", "reflector"])
+KINDS = [also(LIGHT, 4096, 0.9), (REFLECTOR, 1024, 0.02)]
+
+
+@pytest.mark.parametrize("kind, spp, off", KINDS, ids=["light", "reflector"])
 def test_turned_normals(kind, spp, off):
     """Without `primary`, which plans left out while only normals changed, the gain is off by more than `off`."""
     motion, spec = leaning(kind), {"type": "psdr_path", "max_depth": 2}
