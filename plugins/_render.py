@@ -126,7 +126,7 @@ class TermIntegrator(ADIntegrator):
             grad_in = self.aovs.backward(call, prepared, grad_in)
             for term, job in prepared.jobs:
                 term.backward(job, grad_in)
-            for moving in prepared.moving:
+            for moving in reversed(prepared.moving):
                 moving.hand_on()
             dr.eval()
 

@@ -41,7 +41,8 @@ class PathSpaceIntegrator(TermIntegrator):
      * - form
        - |string|
        - What path vertices do while a parameter changes: `spatial` (slide along their rays), `material` (stay on their
-         surfaces) or `auto`, whichever suits the scene (Default: auto)
+         surfaces), `film` (places on the film follow what a moving camera sees) or `auto`, whichever suits the scene
+         (Default: auto)
      * - plan
        - |string|
        - `lean` leaves out what is certainly 0, `full` computes everything, for comparison; or the text of a plan that

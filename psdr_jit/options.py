@@ -11,8 +11,11 @@ from .errors import OptionError, did_you_mean
 #: `max_depth = -1` in a scene file: unlimited. Mitsuba's own encoding.
 UNLIMITED = 0xFFFFFFFF
 
+#: Places on the film follow what is seen there, while the camera moves; path vertices slide along their rays.
+FILM = "film"
+
 #: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points.
-FORMS = ("spatial", "material")
+FORMS = ("spatial", "material", FILM)
 
 #: Leave out what does not contribute, or compute everything, for comparison.
 PLANS = ("lean", "full")

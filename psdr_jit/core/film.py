@@ -130,7 +130,8 @@ def develop_boundary(film: mi.Film, pos, value, alpha, wavelengths, active) -> m
 
     The interior image converges to ∫ f L / ∫ f over the sampled window, so the boundary integral ∫ f ΔL v dl
     needs the same denominator; dividing by the *discrete* sum of filter weights (a "normalised" splat) is another
-    estimator, and scaling by the border's area is wrong. Attached where `value` and `alpha` are.
+    estimator, and scaling by the border's area is wrong. Attached where `value`, `alpha` and `pos` are, to the latter
+    if the filter has a slope.
     """
     lower, upper = sampled_window(film)
     inside = (pos.x >= lower[0]) & (pos.x < upper[0]) & (pos.y >= lower[1]) & (pos.y < upper[1])

@@ -14,21 +14,17 @@ import mitsuba as mi
 
 from ..core.counters import Counters
 from ..core.film import require_film
-from ..core.line_guide import LineTally
 from ..core.memory import Memory, Slot
-from ..core.streams import other_seed
 from ..edges.convexity import lone_convex
 from ..edges.followed_lights import followed_lights
 from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
-from ..options import Options, require_runtime, samples_per_pixel
+from ..options import FILM, Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
-from ..plan.form_choice import forms_to_try
-from ..plan.job import Job, in_motion, surfaces_of_call
+from ..plan.form_choice import forms_to_try, why_film_rests
+from ..plan.job import Job
 from ..plan.light_plan import plan_light
-from ..plan.motion import Motion, SceneMotion
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
-from ..plan.probe_motion import probe_motion
 from ..plan.term import Term
 from ..scene.checks import require_supported
 from ..scene.facts import SceneFacts, analyse
@@ -37,6 +33,7 @@ from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
 from .noise_log import NoiseLog
 from .pilot import Measurement
+from .question import Question
 from .terms import TERMS
 from .warn_about import warn_about
 
@@ -48,8 +45,6 @@ BY_NOISE = "by measured noise, of terms, pixels and lines, as costly as equal on
 
 #: What is known of the noise of each kind of call, and the latest pilot of each kind by its number.
 NOISE: Slot[dict[tuple, NoiseLog]] = Slot(dict)
-#: Of one render call: the motion of everything that can move, once it has been asked for.
-PROBE: Slot[Motion | None] = Slot(lambda: None)
 PILOTS: Slot[dict[tuple, dict[int, Measurement]]] = Slot(dict)
 
 
@@ -70,39 +65,6 @@ class Prepared:
             self.log.observe(self.plan.form, seed, {t.name: t.spp for t in self.plan.terms}, images)
 
 
-@dataclass(frozen=True)
-class _Question:
-    """A call while its plan is being made."""
-
-    call: Call
-    facts: SceneFacts
-    budgets: Mapping[str, int]  # paths per pixel by term, as asked for
-    shared: Memory
-
-    @property
-    def automatic(self) -> bool:
-        """May budgets follow the measured noise?"""
-        return self.call.options.plan == "lean" and not self.call.options.budgets_set
-
-    def job(self, plan: Plan, spp: int, term: TermPlan | None = None, tally: LineTally | None = None) -> Job:
-        """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes. `tally`: listens."""
-        surfaces = surfaces_of_call(self.call, self.facts, self.shared)
-        film, lines = (None, None) if term is None else (term.film, term.lines)
-        motion = SceneMotion(self.call.sensor, surfaces)
-        # What a guide has learned from must be independent of what it draws, also if a seed comes back.
-        call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
-        probe = self.probe if tally is not None and call.mode == "backward" else None
-        return Job(call, self.facts, plan, motion, self.shared, spp, film, lines, tally, probe)
-
-    @property
-    def probe(self) -> Motion:
-        """The motion of everything that can move, found once per render call."""
-        if self.shared[PROBE] is None:
-            surfaces = surfaces_of_call(self.call, self.facts, self.shared)
-            self.shared[PROBE] = probe_motion(self.call.scene, self.facts, surfaces)
-        return self.shared[PROBE]
-
-
 def prepare(call: Call) -> Prepared:
     """The plan and its jobs. Raises typed errors before any ray is traced."""
     _require_unfrozen()
@@ -114,7 +76,7 @@ def prepare(call: Call) -> Prepared:
     facts = _facts(call)
     require_supported(facts, call.memory)
     warn_about(call, facts)
-    question = _Question(call, facts, budgets, Memory())
+    question = Question(call, facts, budgets, Memory())
     plan, log = _plan(question) if given is None else (_as_given(given, question), None)
     switched_off = any(term.reason == SWITCHED_OFF for term in plan.terms)
     if not plan.running and facts.anything_enabled and not switched_off:
@@ -124,7 +86,13 @@ def prepare(call: Call) -> Prepared:
     listens = log is not None and question.automatic  # in every call: others would need kernels of their own
     tallies = {t.name: log.heard(plan.form, t.name) if listens else None for t in plan.running}
     jobs = [(by_name[t.name], question.job(plan, t.spp, t, tallies[t.name])) for t in plan.running]
-    return Prepared(plan, facts, jobs, log, lambda spp: question.job(plan, spp), in_motion(question.shared))
+    return Prepared(plan, facts, jobs, log, _plain(question, plan), question.moving)
+
+
+def _plain(q: Question, plan: Plan) -> Callable[[int], Job]:
+    """Jobs of what is no term, for which places on the film rest."""
+    resting = replace(plan, form="spatial") if plan.form == FILM else plan
+    return lambda spp: q.job(resting, spp)
 
 
 def _require_unfrozen() -> None:
@@ -162,13 +130,16 @@ def _given(options: Options) -> Plan | None:
     return plan
 
 
-def _as_given(plan: Plan, q: _Question) -> Plan:
+def _as_given(plan: Plan, q: Question) -> Plan:
     """The plan as it was given, but for terms with a budget of 0. Raises if it leaves out what is needed."""
     geometry = _geometry(q, plan.prunes)
     fresh = decide(TERMS, q.facts, q.call.options, geometry, dict.fromkeys(q.budgets, 1))
     needed = {t.name for t in fresh if t.runs}
     missing = needed - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
     missing |= _with_edges(plan, q) & needed
+    film_rests = why_film_rests(q.call, q.facts)
+    if plan.form == FILM and film_rests:
+        raise OptionError(f"the given plan has the form 'film', but {film_rests}; make it anew with psdr_jit.make_plan")
     if missing:
         raise OptionError(
             f"the given plan leaves out {', '.join(sorted(missing))}, which this derivative needs: it was made for "
@@ -179,7 +150,7 @@ def _as_given(plan: Plan, q: _Question) -> Plan:
     return replace(plan, terms=tuple(replace(t, **off) if budgets[t.name] == 0 else t for t in plan.terms))
 
 
-def _with_edges(plan: Plan, q: _Question) -> set[str]:
+def _with_edges(plan: Plan, q: Question) -> set[str]:
     """Terms that were left out for want of edges, and have some in this scene."""
     out = {t.name for t in plan.terms if t.reason == NO_EDGES}
     with dr.suspend_grad():
@@ -206,11 +177,12 @@ def _budgets(call: Call) -> dict[str, int]:
     return budgets
 
 
-def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
+def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     call, budgets = q.call, q.budgets
     geometry = _geometry(q, call.options.plan == "lean")
-    forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry)
+    film_rests = why_film_rests(call, q.facts)
+    forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, film_rests)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
         terms = decide(TERMS, q.facts, call.options, geometry, spp)
@@ -242,7 +214,7 @@ def _plan(q: _Question) -> tuple[Plan, NoiseLog | None]:
     return _spread(plan, log.current) if automatic else plan, log
 
 
-def _geometry(q: _Question, prunes: bool) -> Geometry:
+def _geometry(q: Question, prunes: bool) -> Geometry:
     """What the terms want to know about the shapes' vertices, where anything is left out by it."""
     call = q.call
     if not q.facts.geometry_moves:
@@ -254,21 +226,22 @@ def _geometry(q: _Question, prunes: bool) -> Geometry:
     return Geometry(alone, "" if lights is None else lights.names[0])
 
 
-def _kind(q: _Question, forms: tuple[str, ...]) -> tuple:
+def _kind(q: Question, forms: tuple[str, ...]) -> tuple:
     """What calls of one kind have in common, whatever their budgets."""
     o, sensor = q.call.options, q.call.sensor
     options = (o.max_depth, o.rr_depth, o.hide_emitters, o.plan, o.direction, o.guide, o.light_paths)
     return (q.facts.enabled, q.facts.sensor.name, tuple(sensor.film().crop_size()), options, forms)
 
 
-def _pilot(q: _Question, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int) -> Measurement:
+def _pilot(q: Question, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int) -> Measurement:
     """The pilot of this epoch; run unless an integrator with the same memory has done so."""
     found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
 
         def job_of(form: str, seed: int, spp: int) -> Job:
             call = replace(q.call, seed=seed, counters=Counters())
-            return Job(call, q.facts, replace(plan, form=form), q.probe, q.shared, spp)
+            formed = replace(plan, form=form)
+            return Job(call, q.facts, formed, q.probe_of(formed), q.shared, spp)
 
         found.clear()
         sky = q.call.scene.environment() is not None

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.camera_rays import camera_rays
+from ..core.camera_rays import RayPerPixel, camera_rays, ray_per_pixel
 from ..core.film_samples import FilmSamples
 from ..core.low_discrepancy import LaneSampler
 from ..core.streams import Stream, stream_seed
@@ -33,6 +33,7 @@ class CameraPass:
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
     at: films.FilmPoints
+    per_px: RayPerPixel | None  # where film positions move
 
     sought = False  # which of them meet what moves is not known
 
@@ -66,7 +67,9 @@ def camera_passes(job: Job) -> Iterator[CameraPass]:
         samples = FilmSamples.over(film, part.spp, part.density)
         lane = dr.arange(mi.UInt32, samples.count)
         rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
-        ray, weight, p = camera_rays(job.sensor, samples, rng, lane)
+        ray, weight, p, numbers = camera_rays(job.sensor, samples, rng, lane)
+        per_px = None if job.film_flow is None else ray_per_pixel(job.sensor, p, numbers)
         at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
-        dr.eval(dr.detach(ray), weight, p, at.weight)  # at once: films are written and read after paths are traced
-        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at)
+        # at once: films are written and read after paths are traced
+        dr.eval(dr.detach(ray), weight, p, at.weight, per_px)
+        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at, per_px)

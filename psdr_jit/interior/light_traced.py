@@ -266,7 +266,7 @@ def _forward(job: Job, found: TurnedPaths, flow: Flow) -> mi.TensorXf:
         with dr.resume_grad():
             ray = _camera_ray(job, found)
         o_grad, d_grad = job.motion.camera_tangents(ray)
-    dL = forward_sweep(found.records, o_grad, d_grad, flow, job.motion)
+    dL, _ = forward_sweep(found.records, o_grad, d_grad, flow, job.motion)
     return _splat(job, found, job.call.counters.rejected.keep_finite(dL))
 
 
@@ -277,7 +277,7 @@ def _backward(job: Job, found: TurnedPaths, flow: Flow, grad_in: mi.TensorXf) ->
         backpropagate(_splat(job, found, values), grad_in)
         δL = dr.grad(values)
     films.clear(job.film)
-    λ_o, λ_d = backward_sweep(found.records, δL, flow, job.motion)
+    λ_o, λ_d, _ = backward_sweep(found.records, δL, flow, job.motion)
     if job.facts.camera_moves:
         dr.eval(λ_o, λ_d)  # stored, as in `term`: a pose asks for each of them twelve times
         with dr.resume_grad():

@@ -99,8 +99,9 @@ class SphereRims:
 
     @staticmethod
     def of(job: Job) -> SphereRims | None:
-        """None where no vertex slides on a sphere, or none is known to be seen."""
-        if job.form != "spatial" or KINDS.get(job.sensor.class_name()) not in ("perspective", "thinlens"):
+        """None where no vertex slides on a sphere, as much as its rim tells, or none is known to be seen."""
+        known = KINDS.get(job.sensor.class_name()) in ("perspective", "thinlens")
+        if job.form != "spatial" or job.film_flow is not None or not known:
             return None
         found = [
             shape.index

@@ -25,7 +25,8 @@ from .flow import Flow
 
 @dr.syntax
 def backward_sweep(records: PathRecords, δL: mi.Spectrum, flow: Flow, motion: Motion):
-    """Accumulate ⟨δL, dL⟩ into the scene's parameters; returns the adjoints `(λ_o, λ_d)` of the camera rays.
+    """Accumulate ⟨δL, dL⟩ into the scene's parameters; returns the adjoints of the camera rays and what these bring,
+    `(λ_o, λ_d, L)`.
 
     `δL`: adjoint of each path's radiance, detached.
     """
@@ -47,14 +48,18 @@ def backward_sweep(records: PathRecords, δL: mi.Spectrum, flow: Flow, motion: M
             λ_d = mi.Vector3f(dr.grad(d))
         rest = dr.detach(Lo)
         active = k > 0
-    return λ_o, λ_d
+    return λ_o, λ_d, rest
 
 
 @dr.syntax
 def forward_sweep(records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f, flow: Flow, motion: Motion):
-    """Derivative of each path's radiance, given the tangents `(ȯ, ḋ)` of its camera ray. Detached result."""
+    """`(dL, L)` of each path: derivative of its radiance, given the tangents `(ȯ, ḋ)` of its camera ray, and itself.
+
+    Detached.
+    """
     k = mi.UInt32(0)
     dL = mi.Spectrum(0)
+    L = mi.Spectrum(0)
     β_grad = mi.Spectrum(0)
     o_grad = mi.Vector3f(o_grad)
     d_grad = mi.Vector3f(d_grad)
@@ -71,9 +76,10 @@ def forward_sweep(records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f
             # x is an input of L: keep the gradients of interior nodes until they have been read
             L_grad, w_grad, x_grad, onward_grad = tangents(t.L, t.w, t.x, t.d)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad
+        L += v.β * dr.detach(t.L)
         β_grad = β_grad * dr.detach(t.w) + v.β * w_grad
         o_grad = mi.Vector3f(x_grad)
         d_grad = mi.Vector3f(onward_grad)
         k += 1
         active = k < count
-    return dL
+    return dL, L

@@ -12,7 +12,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..core.ad import accumulate
+from ..core.ad import accumulate, tangents
 from ..core.memory import Slot
 from ..core.streams import Stream
 from ..edges.followed_lights import followed_lights
@@ -28,7 +28,7 @@ from ..plan.reasons import what_changes
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from ..scene.registry import registry_table
-from . import light_traced
+from . import film_places, light_traced
 from .along_walk import MaterialTangents, RadianceTangents
 from .camera_pass import CameraPass, camera_passes
 from .flow import Flow, SceneTraits
@@ -153,21 +153,38 @@ def _skipped(job: Job, p: CameraPass | RimPass, records: PathRecords) -> mi.Floa
     return dr.dot(first.hit.o - dr.detach(p.ray.o), dr.detach(p.ray.d))
 
 
-def _derivatives(job: Job, p: CameraPass | RimPass) -> mi.Spectrum:
-    """Derivative of the radiance of every path of a pass, along the tangents set on the scene's parameters."""
+def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
+    """Derivative image of the paths of a pass, along the tangents set on the scene's parameters."""
     if paths_rest(job):
-        return _along_the_walk(job, p)
+        return p.develop(job.film, _along_the_walk(job, p))
     records, lane = _record(job, p)
     dL = dr.zeros(mi.Spectrum, p.count)
-    if dr.width(lane) > 0:
-        o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-        if job.facts.camera_moves:
-            o_grad, d_grad = job.motion.camera_tangents(p.ray)
-            o_grad = o_grad + _skipped(job, p, records) * d_grad
-        recorded = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
-        dr.scatter(dL, job.call.counters.rejected.keep_finite(recorded), lane)
+    if dr.width(lane) == 0:
+        return p.develop(job.film, dL)
+    o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+    if job.facts.camera_moves:
+        o_grad, d_grad = _camera_tangents(job, p)
+        o_grad = o_grad + _skipped(job, p, records) * d_grad
+    recorded, L = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
+    keep_finite = job.call.counters.rejected.keep_finite
+    dr.scatter(dL, keep_finite(recorded), lane)
+    if job.film_flow is None:
         dr.eval(dL)  # the splat reads it inside a recorded loop, where pending writes are not seen
-    return dL
+        return p.develop(job.film, dL)
+    L = keep_finite(L)
+    dr.eval(dL, L)
+    return p.develop(job.film, dL) + film_places.forward(job, p, records, L)
+
+
+def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """`(ȯ, ḋ)` of the camera rays of a pass."""
+    o_grad, d_grad = job.motion.camera_tangents(p.ray)
+    if job.film_flow is None:
+        return o_grad, d_grad
+    with dr.resume_grad(job.film_flow.nodes):
+        shift = tangents(job.film_flow.at(p.at.p)[0])
+    o, d = p.per_px.moved(shift)
+    return o_grad + o, d_grad + d
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -177,7 +194,7 @@ def forward(job: Job) -> mi.TensorXf:
         rims = None if paths_rest(job) else SphereRims.of(job)
         for p in camera_passes(job):
             for part in with_rims(rims, p):
-                image += p.share * part.develop(job.film, _derivatives(job, part))
+                image += p.share * _derivative(job, part)
             found = _from_light(job, p)
             if found is not None:
                 image += p.share * light_traced.forward(job, found, flow_of(job))
@@ -207,14 +224,19 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
     if dr.width(lane) == 0:
         return
     δL = dr.gather(mi.Spectrum, share * p.adjoint(job.film, grad_in), lane)
-    λ_o, λ_d = backward_sweep(records, δL, flow_of(job), job.motion)
+    λ_o, λ_d, L = backward_sweep(records, δL, flow_of(job), job.motion)
     if job.facts.camera_moves:
         λ_d = λ_d + _skipped(job, p, records) * λ_o
         # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
-        dr.eval(λ_o, λ_d)
+        dr.eval(λ_o, λ_d, *([] if job.film_flow is None else [L]))
         with dr.resume_grad():
             adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
+            if job.film_flow is not None:
+                o, d = p.per_px.moved(job.film_flow.at(p.at.p)[0])
+                adjoint += dr.dot(o, λ_o) + dr.dot(d, λ_d)
             accumulate(adjoint)  # other terms need the sensor's edges
+    if job.film_flow is not None:
+        film_places.backward(job, p, records, job.call.counters.rejected.keep_finite(L), share * grad_in)
     dr.eval()
 
 

@@ -9,27 +9,60 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from ..options import Options
+from ..core.sensor_frame import KINDS
+from ..options import FILM, Options
 from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts
+from .call import Call
 from .plan import Geometry
 
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
 CONTACT = 0.02
 
+#: The reason for the first form where a pilot would choose, but has nothing to go by.
+NOTHING_TO_COMPARE = "there is no noise to compare the forms by"
+
 
 def forms_to_try(
-    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry
+    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry, film_rests: str
 ) -> tuple[tuple[str, ...], str]:
-    """The forms that come into question, the safer one first, and the reason if there is one only."""
+    """The forms that come into question, the safer one first, and the reason if there is one only.
+
+    `film_rests`: see `why_film_rests`.
+    """
     if facts.geometry_moves and facts.has_delta_lobes:
         return ("spatial",), "directions follow mirrors and glass"
     # points of a B-spline are followed, but not as its texture coordinates turn about its axis
     unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL or (s.kind == "curve" and s.patterns)]
     if facts.geometry_moves and unmapped:
         return ("spatial",), f"the points of '{unmapped[0]}' are not followed"
+    if options.form == FILM and film_rests:
+        return ("spatial",), film_rests
     if options.form != "auto":
         return (options.form,), "as asked for"
+    forms, reason = _of_vertices(scene, facts, options, geometry)
+    if film_rests or not any(shape.painted for shape in facts.shapes):  # else it has more noise, not less
+        return forms, reason
+    return (*forms, FILM), NOTHING_TO_COMPARE
+
+
+def why_film_rests(call: Call, facts: SceneFacts) -> str:
+    """Why places on the film cannot follow what is seen; "" if they can."""
+    if not facts.camera_moves:
+        return "the camera rests, and so do places on the film"
+    if call.sensor.class_name() not in KINDS:
+        return f"places on the film of a '{call.sensor.class_name()}' are not followed"
+    if call.film.rfilter().is_box_filter():
+        return "a box filter has no slope along which places on the film could move"
+    if call.options.light_paths != "off":
+        return "light subpaths end at places on the film that rest"
+    return ""
+
+
+def _of_vertices(
+    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry
+) -> tuple[tuple[str, ...], str]:
+    """The forms that differ in what path vertices do."""
     if not facts.geometry_moves:
         return ("spatial",), "nothing moves, so the forms are the same"
     if options.depth_limit < 3:
@@ -39,7 +72,7 @@ def forms_to_try(
     touching = _touching(scene, facts)
     if touching:
         return ("spatial",), f"{touching} touch and move against each other"
-    return ("spatial", "material"), "there is no noise to compare the forms by"
+    return ("spatial", "material"), NOTHING_TO_COMPARE
 
 
 def _touching(scene: mi.Scene, facts: SceneFacts) -> str:

@@ -15,7 +15,7 @@ from ..core.line_guide import LineGuide, LineTally
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..core.varying import varying
-from ..options import Options
+from ..options import FILM, Options
 from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.edge_on import EdgeOn
 from ..paths.light_technique import LightTechnique
@@ -26,8 +26,9 @@ from ..scene.facts import SceneFacts
 from ..scene.mesh_tables import CallVariables
 from ..scene.surfaces import Surfaces, surfaces_of
 from .call import Call
+from .film_flow import FilmFlow, FilmMotion
 from .light_plan import light_technique
-from .motion import Motion, SceneMotion
+from .motion import Motion
 from .plan import Plan
 
 #: Of one render call: the geometry of its sensor.
@@ -95,13 +96,18 @@ class Job:
 
     @property
     def form(self) -> str:
-        """What path vertices do while θ changes, see `options.FORMS`."""
-        return self.plan.form
+        """What path vertices do while θ changes, "spatial" or "material"."""
+        return "spatial" if self.plan.form == FILM else self.plan.form
+
+    @property
+    def film_flow(self) -> FilmFlow | None:
+        """Where places on the film go, if they do."""
+        return self.motion.flow if isinstance(self.motion, FilmMotion) else None
 
     @property
     def learns(self) -> bool:
         """Do samples of this job tell about the scene's own motion, and not about a probe's?"""
-        return isinstance(self.motion, SceneMotion)
+        return self.motion.of_scene
 
     @property
     def frame(self) -> SensorFrame:

@@ -86,6 +86,11 @@ class Displacements(ABC):
 class Motion(ABC):
     """Host object of a job: opens the scope in which displacements are attached."""
 
+    @property
+    def of_scene(self) -> bool:
+        """Is it what the scene's parameters stand for, and not a probe's?"""
+        return False
+
     @abstractmethod
     def attached(self, *variables):
         """Context manager that yields `Displacements`. `variables` are attached as well, their gradients enabled."""
@@ -101,6 +106,10 @@ class SceneMotion(Motion):
 
     sensor: mi.Sensor
     surfaces: Surfaces | None = None
+
+    @property
+    def of_scene(self) -> bool:
+        return True
 
     @contextmanager
     def attached(self, *variables) -> Iterator[Displacements]:

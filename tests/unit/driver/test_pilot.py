@@ -158,9 +158,9 @@ def test_structural_rules(llvm, case):
     name, param, depth = case
     scene = scene_of(name)
     with also_enabled(scene, [param]):
-        forms, reason = forms_to_try(scene, analyse(scene), Options(max_depth=depth), Geometry())
+        forms, reason = forms_to_try(scene, analyse(scene), Options(max_depth=depth), Geometry(), "")
         assert forms == FORMS[case] and reason
-        assert forms_to_try(scene, analyse(scene), Options(max_depth=depth, form="material"), Geometry())[0] == (
+        assert forms_to_try(scene, analyse(scene), Options(max_depth=depth, form="material"), Geometry(), "")[0] == (
             "material",
         )
 

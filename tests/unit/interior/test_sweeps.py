@@ -102,14 +102,14 @@ def forward(turns: bool, θ_grad, o_grad, d_grad) -> np.ndarray:
     dr.enable_grad(tilt)
     dr.set_grad(tilt, θ_grad)
     with dr.suspend_grad():
-        return np.array(forward_sweep(record(tilt), o_grad, d_grad, Mirrors(tilt, turns), motion()), dtype=float)
+        return np.array(forward_sweep(record(tilt), o_grad, d_grad, Mirrors(tilt, turns), motion())[0], dtype=float)
 
 
 def backward(turns: bool, δL):
     tilt = mi.Float(TILT)
     dr.enable_grad(tilt)
     with dr.suspend_grad():
-        λ = backward_sweep(record(tilt), δL, Mirrors(tilt, turns), motion())
+        λ = backward_sweep(record(tilt), δL, Mirrors(tilt, turns), motion())[:2]
         dr.eval(*λ)
     return np.array(dr.grad(tilt), dtype=float), *(np.array(a, dtype=float) for a in λ)
 

@@ -1,0 +1,80 @@
+"""A call while its plan is being made: what jobs its terms would get, whatever the plan turns out to be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from ..core.line_guide import LineTally
+from ..core.memory import Memory, Slot
+from ..core.streams import other_seed
+from ..options import FILM
+from ..plan.call import Call
+from ..plan.film_flow import FilmFlow, FilmMotion
+from ..plan.job import Job, in_motion, surfaces_of_call
+from ..plan.motion import Motion, SceneMotion
+from ..plan.plan import Plan, TermPlan
+from ..plan.probe_motion import probe_motion
+from ..scene.facts import SceneFacts
+from ..scene.mesh_tables import CallVariables
+
+#: Of one render call: the motion of everything that can move, once it has been asked for.
+PROBE: Slot[Motion | None] = Slot(lambda: None)
+#: Of one render call: where places on its film go with the scene's motion, and with the probe's.
+FLOW: Slot[FilmFlow | None] = Slot(lambda: None)
+PROBE_FLOW: Slot[FilmFlow | None] = Slot(lambda: None)
+
+
+@dataclass(frozen=True)
+class Question:
+    """A call, the facts it is about, and what its terms will share."""
+
+    call: Call
+    facts: SceneFacts
+    budgets: Mapping[str, int]  # paths per pixel by term, as asked for
+    shared: Memory
+
+    @property
+    def automatic(self) -> bool:
+        """May budgets follow the measured noise?"""
+        return self.call.options.plan == "lean" and not self.call.options.budgets_set
+
+    def job(self, plan: Plan, spp: int, term: TermPlan | None = None, tally: LineTally | None = None) -> Job:
+        """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes. `tally`: listens."""
+        surfaces = surfaces_of_call(self.call, self.facts, self.shared)
+        film, lines = (None, None) if term is None else (term.film, term.lines)
+        motion = self._followed(plan, SceneMotion(self.call.sensor, surfaces), FLOW)
+        # What a guide has learned from must be independent of what it draws, also if a seed comes back.
+        call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
+        probe = self.probe_of(plan) if tally is not None and call.mode == "backward" else None
+        return Job(call, self.facts, plan, motion, self.shared, spp, film, lines, tally, probe)
+
+    def _followed(self, plan: Plan, motion: Motion, slot: Slot[FilmFlow | None]) -> Motion:
+        """A motion as the plan's form has it: seen from places on the film that follow, or rest."""
+        if plan.form != FILM:
+            return motion
+        call = self.call
+        return FilmMotion(
+            motion, self.shared.once(slot, lambda: FilmFlow.of(call.scene, call.sensor, call.film, motion))
+        )
+
+    def probe_of(self, plan: Plan) -> Motion:
+        """The motion of everything that can move, as the plan's form has it."""
+        motion = self._followed(plan, self.probe, PROBE_FLOW)
+        if isinstance(motion, FilmMotion):
+            motion.flow.take_tangents()
+        return motion
+
+    @property
+    def moving(self) -> list[CallVariables]:
+        """Variables in place of what moves, those first that others depend on."""
+        flow = self.shared[FLOW]
+        return in_motion(self.shared) + ([] if flow is None else [flow])
+
+    @property
+    def probe(self) -> Motion:
+        """The motion of everything that can move, found once per render call."""
+        if self.shared[PROBE] is None:
+            surfaces = surfaces_of_call(self.call, self.facts, self.shared)
+            self.shared[PROBE] = probe_motion(self.call.scene, self.facts, surfaces)
+        return self.shared[PROBE]

@@ -1,0 +1,176 @@
+"""The film form: places on the film follow what is seen there. The same derivative as that of the spatial form."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import adjoint_identity, assert_grad_close, fd, forward, load, spec_of
+from problems import Problem
+from variants import also
+
+import psdr_jit
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.driver.prepare import prepare
+from psdr_jit.errors import OptionError
+from psdr_jit.interior import film_places
+
+RES, SPP, SEEDS, STEP = 16, 64, 24, 0.01
+TEXELS = 48  # a side, of the fine picture
+UP = [0, 1, 0]
+FILM, SPATIAL = {"form": "film"}, {"form": "spatial"}
+
+CASES = {  # scene, parameter, motion
+    "moved": ("lit_box", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "turned": ("cbox", "sensor.to_world", {"rotate": (0.48, 0.6, 0.64)}),
+    "view": ("lit_box", "camera.x_fov", {}),
+    "thin-lens": ("thinlens_shadow", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "parallel": ("camera_orthographic", "camera.to_world", {"rotate": (0.48, 0.6, 0.64)}),
+    "crop": ("camera_crop", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "sky": ("envmap_rotation", "camera.to_world", {"rotate": (0.48, 0.6, 0.64)}),
+    "smooth": ("smooth_mesh", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+}
+FAST = ("moved",)
+EACH = [case if case in FAST else also(case) for case in CASES]
+
+
+def motion_of(case: str, **defaults) -> Perturbation:
+    name, param, how = CASES[case]
+    size = {} if case == "crop" else {"res": RES}
+    return perturb(load(Problem(name, param, 0.0), rfilter="gaussian", **size, **defaults), param, **how)
+
+
+def picture(pixel_format: str = "luminance", rfilter: str = "gaussian") -> mi.Scene:
+    """A card whose texels are a third of a pixel, before a grey wall, and a camera."""
+    noise = np.random.default_rng(3).random((TEXELS, TEXELS, 1)).astype(np.float32)
+    texture = {"type": "bitmap", "data": mi.TensorXf(noise), "raw": True, "filter_type": "bilinear"}
+    film = {"type": "hdrfilm", "width": RES, "height": RES, "rfilter": {"type": rfilter}, "pixel_format": pixel_format}
+    pose = mi.ScalarTransform4f()
+    return mi.load_dict({
+        "type": "scene", "lamp": {"type": "point", "position": [0.5, 1, 3], "intensity": 20.0},
+        "card": {"type": "rectangle", "to_world": pose.rotate([0, 1, 0.2], 35), "bsdf":
+                 {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}},
+        "wall": {"type": "rectangle", "to_world": pose.translate([0, 0.4, -2]).scale(1.5)},
+        "camera": {"type": "perspective", "fov": 40, "to_world": pose.look_at([0, 0, 4], [0, 0, 0], UP), "film": film},
+    }, optimize=False)  # fmt: skip
+
+
+def picture_moves(**how) -> Perturbation:
+    return perturb(picture(**how), "camera.to_world", (0.4, 0.3, 0.2))
+
+
+def plan_of(scene: mi.Scene, param: str, kind: str = "psdr_path", **options):
+    return psdr_jit.make_plan(scene, [param], integrator={"type": kind, "max_depth": 2, **options})
+
+
+@pytest.mark.parametrize("case", EACH)
+def test_it_is_the_same_derivative(llvm, case):
+    motion = motion_of(case)
+    ours = forward(motion, spec_of(motion.scene, **FILM), SEEDS, SPP)
+    assert_grad_close(ours, forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP))
+
+
+@pytest.mark.parametrize("case", [*EACH[:1], "turned", *EACH[2:]])
+def test_forward_and_backward_are_transposes(llvm, case):
+    motion = motion_of(case)
+    integrator = integrator_specs.build(spec_of(motion.scene, **FILM))
+    wJv, JTwv, w, Jv = adjoint_identity(motion.scene, CASES[case][1], integrator)
+    assert integrator.plan.form == "film" and Jv > 0
+    assert abs(wJv - JTwv) <= 1e-5 * w * Jv
+
+
+def test_other_things_may_move_as_well(llvm):
+    """Both the card and the camera depend on one number: the flow hands on to both."""
+    scene = picture()
+    params = psdr_jit.traverse(scene)
+    names = ("card.to_world", "camera.to_world")
+    poses = {name: mi.Transform4f(params[name]) for name in names}
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, **FILM})
+
+    def attach() -> mi.Float:
+        θ = mi.Float(0)
+        dr.enable_grad(θ)
+        for name, towards in zip(names, ((0, 1, 0), (1, 0, 0.5)), strict=True):
+            params[name] = mi.Transform4f().translate(θ * mi.Vector3f(towards)) @ poses[name]
+        params.update()
+        return θ
+
+    θ = attach()
+    dr.forward(θ, dr.ADFlag.ClearEdges)
+    image = np.array(integrator.render_forward(scene, params, seed=1, spp=8), np.float64)
+    assert integrator.plan.form == "film"
+    w = np.random.default_rng(1).normal(size=image.shape)
+    θ = attach()
+    integrator.render_backward(scene, params, mi.TensorXf(w.astype(np.float32)), seed=1, spp=8)
+    bound = np.linalg.norm(w) * np.linalg.norm(image)
+    assert abs(float(dr.grad(θ)[0]) - (w * image).sum()) < 1e-5 * bound
+
+
+def test_fine_pictures_are_less_noisy_and_it_is_chosen(llvm):
+    """Of slopes of texels the spatial form sees the largest part of their noise."""
+    motion = picture_moves()
+    spec = {"type": "psdr_path", "max_depth": 2}
+    film, spatial = (forward(motion, {**spec, **form}, SEEDS, SPP) for form in (FILM, SPATIAL))
+    assert 5 * film.var(0, ddof=1).mean() < spatial.var(0, ddof=1).mean()
+    assert_grad_close(film, fd(motion, {"type": "path", "max_depth": 2}, STEP, SEEDS, 4096))
+    plan = plan_of(motion.scene, "camera.to_world")
+    assert plan.form == "film" and "than spatial, by a pilot" in plan.form_reason
+
+
+def test_what_moving_places_bring_could_have_been_missing(llvm, monkeypatch):
+    """The comparison above can fail: nearly all of the derivative is there."""
+    motion = picture_moves()
+    spec = {"type": "psdr_path", "max_depth": 2, **FILM}
+    whole = forward(motion, spec, SEEDS, SPP)
+    monkeypatch.setattr(film_places, "forward", lambda job, p, records, L: mi.TensorXf(0.0))
+    with pytest.raises(AssertionError, match="gain"):
+        assert_grad_close(forward(motion, spec, SEEDS, SPP), whole, max_stderr=1.0)
+
+
+def test_coverage_moves_too(llvm):
+    """The alpha channel, which nothing but outlines changes, by both forms."""
+    motion = picture_moves(pixel_format="rgba")
+    film, spatial = (
+        forward(motion, {"type": "psdr_path", "max_depth": 2, **form}, SEEDS, SPP)[..., 3:] for form in (FILM, SPATIAL)
+    )
+    assert_grad_close(film, spatial)
+
+
+def test_a_pass_at_a_time(llvm):
+    """In several passes, as memory demands, the same derivative."""
+    motion = picture_moves()
+    spec = {"type": "psdr_path", "max_depth": 8, **FILM}
+    whole, parts = (forward(motion, {**spec, "record_mib": mib}, 8, 512) for mib in (512, 16))
+    assert_grad_close(parts, whole)
+
+
+def test_where_places_on_the_film_rest(llvm):
+    """The plan says why; where nothing is painted the form is not tried."""
+    scene = picture()
+    assert plan_of(scene, "camera.to_world", **FILM).form == "film"
+    for plan, why in (
+        (plan_of(scene, "card.to_world", **FILM), "the camera rests"),
+        (plan_of(picture(rfilter="box"), "camera.to_world", **FILM), "box filter"),
+        (plan_of(scene, "camera.to_world", "psdr_bdpt", **FILM), "light subpaths"),
+    ):
+        assert plan.form == "spatial" and why in plan.form_reason
+    plain = motion_of("moved").scene
+    assert "film" not in plan_of(plain, "camera.to_world").form_reason
+
+
+def test_a_given_plan_is_one_of_its_film(llvm):
+    scene, box = picture(), picture(rfilter="box")
+    text = plan_of(scene, "camera.to_world", **FILM).to_json()
+    for there, match in ((scene, None), (box, "box filter")):
+        motion = perturb(there, "camera.to_world", (1, 0, 0))
+        motion.attach()
+        integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "plan": text})
+        call = integrator.call(there, there.sensors()[0], 0, 4)
+        if match is None:
+            assert prepare(call).plan.form == "film"
+        else:
+            with pytest.raises(OptionError, match=match):
+                prepare(call)
+        motion.restore()
