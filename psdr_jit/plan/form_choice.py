@@ -56,6 +56,8 @@ def why_film_rests(call: Call, facts: SceneFacts) -> str:
         return "a box filter has no slope along which places on the film could move"
     if call.options.light_paths != "off":
         return "light subpaths end at places on the film that rest"
+    if facts.has_delta_lobes:
+        return "lines across the film, along which mirrors and glass are looked at, rest"
     return ""
 
 

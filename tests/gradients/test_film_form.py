@@ -42,7 +42,7 @@ def motion_of(case: str, **defaults) -> Perturbation:
     return perturb(load(Problem(name, param, 0.0), rfilter="gaussian", **size, **defaults), param, **how)
 
 
-def picture(pixel_format: str = "luminance", rfilter: str = "gaussian") -> mi.Scene:
+def picture(pixel_format: str = "luminance", rfilter: str = "gaussian", wall: str = "diffuse") -> mi.Scene:
     """A card whose texels are a third of a pixel, before a grey wall, and a camera."""
     noise = np.random.default_rng(3).random((TEXELS, TEXELS, 1)).astype(np.float32)
     texture = {"type": "bitmap", "data": mi.TensorXf(noise), "raw": True, "filter_type": "bilinear"}
@@ -52,7 +52,7 @@ def picture(pixel_format: str = "luminance", rfilter: str = "gaussian") -> mi.Sc
         "type": "scene", "lamp": {"type": "point", "position": [0.5, 1, 3], "intensity": 20.0},
         "card": {"type": "rectangle", "to_world": pose.rotate([0, 1, 0.2], 35), "bsdf":
                  {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}},
-        "wall": {"type": "rectangle", "to_world": pose.translate([0, 0.4, -2]).scale(1.5)},
+        "wall": {"type": "rectangle", "to_world": pose.translate([0, 0.4, -2]).scale(1.5), "bsdf": {"type": wall}},
         "camera": {"type": "perspective", "fov": 40, "to_world": pose.look_at([0, 0, 4], [0, 0, 0], UP), "film": film},
     }, optimize=False)  # fmt: skip
 
@@ -161,9 +161,9 @@ def test_where_places_on_the_film_rest(llvm):
 
 
 def test_a_given_plan_is_one_of_its_film(llvm):
-    scene, box = picture(), picture(rfilter="box")
+    scene, box, mirror = picture(), picture(rfilter="box"), picture(wall="conductor")
     text = plan_of(scene, "camera.to_world", **FILM).to_json()
-    for there, match in ((scene, None), (box, "box filter")):
+    for there, match in ((scene, None), (box, "box filter"), (mirror, "mirrors and glass")):
         motion = perturb(there, "camera.to_world", (1, 0, 0))
         motion.attach()
         integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "plan": text})
