@@ -131,8 +131,7 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
         emission = mi.Bool(False)
     L, _, surface = walk(job.scene, rng, ray, pi, job.limits_beside, NoSink(), emission, differs)
     L *= weight
-    sky = job.scene.environment() is not None and not job.options.hide_emitters
-    alpha = mi.Float(1) if sky else dr.select(surface, mi.Float(1), 0)
+    alpha = mi.Float(1) if job.sky_is_seen else dr.select(surface, mi.Float(1), 0)
     alpha += dr.zeros(mi.Float, 2 * n)  # full width, whatever it is made of
     dr.eval(L, alpha, wavelengths)
     return L, alpha, wavelengths

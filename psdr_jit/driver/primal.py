@@ -69,7 +69,7 @@ def _from_camera(job: Job, p: CameraPass, limits: PathLimits) -> mi.TensorXf:
     ray, pi, emission = first_hit(job.scene, mi.Ray3f(dr.detach(p.ray)), job.options.hide_emitters)
     sampler = p.sampler(dr.arange(mi.UInt32, p.samples.count))
     L, _, surface = walk(job.scene, sampler, ray, pi, limits, NoSink(), emission, mi.Bool(True))
-    if job.scene.environment() is not None and not job.options.hide_emitters:
+    if job.sky_is_seen:
         surface = mi.Bool(True)
     alpha = dr.select(surface, mi.Float(1), 0)
     L = job.call.counters.rejected.keep_finite(L)

@@ -43,27 +43,28 @@ class Question:
         """The job of a term that gets `spp` paths per pixel, spread as `term` of the plan wishes. `tally`: listens."""
         surfaces = surfaces_of_call(self.call, self.facts, self.shared)
         film, lines = (None, None) if term is None else (term.film, term.lines)
-        motion = self._followed(plan, SceneMotion(self.call.sensor, surfaces), FLOW)
+        motion = own = SceneMotion(self.call.sensor, surfaces)
+        if plan.form == FILM:
+            motion = FilmMotion(own, self.shared.once(FLOW, lambda: self._flow_of(own)))
         # What a guide has learned from must be independent of what it draws, also if a seed comes back.
         call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
         probe = self.probe_of(plan) if tally is not None and call.mode == "backward" else None
         return Job(call, self.facts, plan, motion, self.shared, spp, film, lines, tally, probe)
 
-    def _followed(self, plan: Plan, motion: Motion, slot: Slot[FilmFlow | None]) -> Motion:
-        """A motion as the plan's form has it: seen from places on the film that follow, or rest."""
-        if plan.form != FILM:
-            return motion
-        call = self.call
-        return FilmMotion(
-            motion, self.shared.once(slot, lambda: FilmFlow.of(call.scene, call.sensor, call.film, motion))
-        )
+    def _flow_of(self, motion: Motion) -> FilmFlow:
+        return FilmFlow.of(self.call.scene, self.call.sensor, self.call.film, motion)
 
     def probe_of(self, plan: Plan) -> Motion:
-        """The motion of everything that can move, as the plan's form has it."""
-        motion = self._followed(plan, self.probe, PROBE_FLOW)
-        if isinstance(motion, FilmMotion):
-            motion.flow.take_tangents()
-        return motion
+        """The motion of everything that can move, as the plan's form has it: seen from places that follow, or rest."""
+        if plan.form != FILM:
+            return self.probe
+        return FilmMotion(self.probe, self.shared.once(PROBE_FLOW, self._probe_flow))
+
+    def _probe_flow(self) -> FilmFlow:
+        """With its tangents, which are the same throughout a call."""
+        flow = self._flow_of(self.probe)
+        flow.take_tangents()
+        return flow
 
     @property
     def moving(self) -> list[CallVariables]:

@@ -20,14 +20,18 @@ from ..plan.job import Job
 from .camera_pass import CameraPass
 
 
+def turned(job: Job, p: CameraPass) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Displacements `(of the origin, of the direction)` of a pass's camera rays as their places move, attached."""
+    shift, _ = job.film_flow.at(p.at.p)
+    return p.per_px.moved(shift)
+
+
 def _image(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.TensorXf:
     """Image of the radiance `L` of the paths of a pass, attached to where they are on the film."""
     shift, div = job.film_flow.at(p.at.p)
     share = p.at.weight * (1 + div) / varying(mi.Float, p.samples.spp)
     seen = records.vertex(mi.UInt32(0), records.count > 0).hit.shape != 0
-    if job.scene.environment() is not None and not job.options.hide_emitters:
-        seen = mi.Bool(True)  # as the sky is
-    alpha = dr.select(seen, share, 0)
+    alpha = share if job.sky_is_seen else dr.select(seen, share, 0)
     return films.develop_boundary(
         job.film, p.at.p + shift, L * p.weight * share, alpha, records.wavelengths, mi.Bool(True)
     )

@@ -182,8 +182,7 @@ def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi
     if job.film_flow is None:
         return o_grad, d_grad
     with dr.resume_grad(job.film_flow.nodes):
-        shift = tangents(job.film_flow.at(p.at.p)[0])
-    o, d = p.per_px.moved(shift)
+        o, d = tangents(*film_places.turned(job, p))
     return o_grad + o, d_grad + d
 
 
@@ -232,7 +231,7 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
         with dr.resume_grad():
             adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
             if job.film_flow is not None:
-                o, d = p.per_px.moved(job.film_flow.at(p.at.p)[0])
+                o, d = film_places.turned(job, p)
                 adjoint += dr.dot(o, λ_o) + dr.dot(d, λ_d)
             accumulate(adjoint)  # other terms need the sensor's edges
     if job.film_flow is not None:

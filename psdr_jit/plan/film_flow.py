@@ -34,9 +34,6 @@ from ..core.varying import varying
 from ..paths.walk import first_hit
 from .motion import Displacements, Motion
 
-#: Film positions differ by this much on either side of a corner where its velocity is measured [px].
-STEP = 0.5
-
 
 @dataclass(frozen=True)
 class FilmFlow:
@@ -66,7 +63,7 @@ class FilmFlow:
             ray, _ = sensor.sample_ray(0, 0.5, at, mi.Point2f(0.5))
             _, pi, _ = first_hit(scene, ray, hide_emitters=False)
             inside = (place.x > 0) & (place.y > 0) & (place.x <= last.x) & (place.y <= last.y) & pi.is_valid()
-            per_px = ray_per_pixel(sensor, place + corner, RayNumbers(mi.Point2f(0.5), mi.Float(0), mi.Float(0.5)))
+            per_px = ray_per_pixel(sensor, place + corner, _through(mi.Point2f(0.5)))
             across = _across(per_px, ray, dr.select(inside, pi.t, 1), inside)
             hit = Hit.of(ray, pi)
             dr.eval(hit, at, across)
@@ -109,6 +106,11 @@ class FilmFlow:
         return mi.Vector2f(dr.lerp(left, right, s.x)), (right.x - left.x) + (below.y - above.y)
 
 
+def _through(aperture: mi.Point2f) -> RayNumbers:
+    """Of a ray whose time and wavelength do not matter."""
+    return RayNumbers(aperture, mi.Float(0), mi.Float(0.5))
+
+
 def _across(
     per_px: RayPerPixel, ray: mi.Ray3f, t: mi.Float, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -140,6 +142,7 @@ class FilmMotion(Motion):
             yield FilmDisplacements(moving, self.flow)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """At places that rest: of a ray alone nobody can tell where on the film it is, see `film_places.turned`."""
         return self.base.camera_tangents(ray)
 
 
@@ -155,7 +158,7 @@ class FilmDisplacements(Displacements):
         sensor = self.flow.sensor
         p = dr.detach(film) * sensor.film().crop_size() + sensor.film().crop_offset()
         shift, _ = self.flow.at(p)
-        return ray_per_pixel(sensor, p, RayNumbers(aperture, mi.Float(0), mi.Float(0.5))).moved(shift)
+        return ray_per_pixel(sensor, p, _through(aperture)).moved(shift)
 
     def of_surface(self, hit: Hit) -> mi.Vector3f:
         return self.base.of_surface(hit)

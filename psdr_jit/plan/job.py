@@ -91,6 +91,11 @@ class Job:
         return self.call.options
 
     @property
+    def sky_is_seen(self) -> bool:
+        """Does every camera ray end somewhere, if only in the sky?"""
+        return self.scene.environment() is not None and not self.options.hide_emitters
+
+    @property
     def seed(self) -> int | mi.UInt32:
         return self.call.seed
 
