@@ -24,7 +24,7 @@ from fuzz.verdict import BLOCK, NOISY, REFUSED, RIGHT, SURE, TOLERANCE, VARIANT,
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.sampler import DerivativeSampler
-from psdr_jit.derivative.statistics import block_means, block_test, gain
+from psdr_jit.derivative.statistics import Unseen, block_means, block_test, gain
 from psdr_jit.errors import PsdrError, UnsupportedWarning
 
 SPP, SEEDS, LOOKS = 256, 16, (1, 4, 16)  # a look takes so many times the seeds of the first
@@ -244,7 +244,7 @@ def _judge(other: Any, own: Any, factor: float) -> tuple[str, str]:
     d, f = factor * other.group_means(), own.group_means()
     slope = gain(d, f[::2], f[1::2])
     size = np.abs(block_means(f.mean(0), BLOCK)).max()
-    test = block_test(d, f, BLOCK, TOLERANCE * size / SURE)
+    test = block_test(d, f, BLOCK, Unseen(TOLERANCE * size / SURE))
     off = slope.has_signal and abs(slope.value - 1) > TOLERANCE + SURE * slope.stderr
     text = f"gain {slope.value:.4f} +- {slope.stderr:.4f}, largest |z| {test.max_z:.1f}"
     if off or test.max_z > SURE:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from copy import deepcopy
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from fuzz.alike import WAYS, compare
+from fuzz.alike import WAYS, _judge, compare
 from fuzz.build import build
 from fuzz.scenes import Case, case_of
-from fuzz.verdict import WRONG
+from fuzz.verdict import RIGHT, WRONG
 
 from psdr_jit.scene.params import find_param
 
@@ -40,6 +42,16 @@ def test_scenes_written_anew_load(mono, way):
         if pairs == 3:
             return
     assert pairs > 0
+
+
+@pytest.mark.parametrize(("share", "word"), [(1.0, RIGHT), (0.9, WRONG)])
+def test_images_are_compared(share, word):
+    """The same image with a little noise, and one that lacks a tenth."""
+    rng = np.random.default_rng(0)
+    whole = rng.random((8, 8, 1)) + 1
+    other, own = (SimpleNamespace(group_means=lambda a=a: a + 0.01 * rng.normal(size=(32, 8, 8, 1)))
+                  for a in (share * whole, whole))  # fmt: skip
+    assert _judge(other, own, 1.0)[0] == word
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from fuzz.build import build
 from fuzz.scenes import Case, case_of
 from fuzz.shrink import shrunk, simpler
 from fuzz.specular import bidirectional_case_of, specular_case_of
-from fuzz.verdict import NOISY, RIGHT, WRONG, Effort, Look, Outcome, examine
+from fuzz.verdict import NOISY, RIGHT, WRONG, Effort, Look, Outcome, compare, examine, motion_of
 
 from psdr_jit.derivative.statistics import Gain
 from psdr_jit.scene.params import find_param
@@ -76,6 +76,14 @@ def test_shrinking_leaves_what_matters():
     smallest = shrunk(case, fails, 60.0)
     assert set(smallest["scene"]) == needed | {"type"} and smallest["integrator"]["max_depth"] == 2
     assert not any(fails(smaller) for smaller in simpler(smallest))
+
+
+def test_few_samples_are_compared(mono):
+    case = case_of(WITH_OUTLINES)
+    case["integrator"]["max_depth"] = 2
+    few = Effort(seeds=2, spp=4, reference_spp=4, doublings=0, precision=1, first_seed=0)
+    look = compare(motion_of(case), case, few)
+    assert look.finite and look.estimate.any() and look.estimate.shape == look.reference.shape
 
 
 @pytest.mark.slow

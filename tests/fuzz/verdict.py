@@ -25,7 +25,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.sampler import DerivativeSampler
-from psdr_jit.derivative.statistics import Gain, block_means, block_test, gain
+from psdr_jit.derivative.statistics import Gain, Unseen, block_means, block_test, gain
 from psdr_jit.errors import PsdrError, UnsupportedWarning
 
 RIGHT, WRONG, KINK, NOISY, WARNED, REFUSED = (
@@ -163,7 +163,7 @@ def compare(motion: Perturbation, case: Mapping[str, Any], effort: Effort, finer
     f = np.concatenate(halves)
     size = np.abs(block_means(f.mean(0), BLOCK)).max()
     floor = np.hypot(reference.floor(BLOCK), TOLERANCE * size / SURE)
-    z = block_test(d, f, BLOCK, floor).max_z
+    z = block_test(d, f, BLOCK, Unseen(floor, reference.rare(BLOCK))).max_z
     blocks = (block_means(d.mean(0), BLOCK), block_means(f.mean(0), BLOCK))
     return Look(gain(d, *halves), z, TOLERANCE, estimate.not_finite == 0, *blocks)
 
