@@ -11,11 +11,14 @@ from .errors import OptionError, did_you_mean
 #: `max_depth = -1` in a scene file: unlimited. Mitsuba's own encoding.
 UNLIMITED = 0xFFFFFFFF
 
-#: Places on the film follow what is seen there, while the camera moves; path vertices slide along their rays.
-FILM = "film"
-
 #: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points.
-FORMS = ("spatial", "material", FILM)
+SPATIAL, MATERIAL = "spatial", "material"
+
+#: The same where places on the film follow what is seen there, and what vertices do in each.
+FILM, FILM_MATERIAL = "film", "film-material"
+FOLLOWING = {FILM: SPATIAL, FILM_MATERIAL: MATERIAL}
+
+FORMS = (SPATIAL, MATERIAL, *FOLLOWING)
 
 #: Leave out what does not contribute, or compute everything, for comparison.
 PLANS = ("lean", "full")

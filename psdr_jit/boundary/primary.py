@@ -166,7 +166,7 @@ def per_motion(seen: SeenEdge, sample: EdgeSample) -> mi.Float:
 def steps_at(job: Job, edges: FilmEdges, seen: SeenEdge, sample: EdgeSample, values: tuple) -> Steps:
     """Samples ready to be moved; `values`: (contribution, coverage, wavelengths)."""
     sight, view = seen.sight, seen.view
-    turn = edges.table.turn(sight.at, view.ω, sight.n_perp) if job.facts.camera_moves else mi.Vector3f(0)
+    turn = edges.table.turn(sight.at, view.ω, sight.n_perp) if job.facts.view_moves else mi.Vector3f(0)
     place = (view.p, view.film, sample.aperture)
     return Steps(sight.at, view.ω, sight.n_perp, turn, *place, *values, seen.valid, sample.drawn)
 
@@ -174,7 +174,7 @@ def steps_at(job: Job, edges: FilmEdges, seen: SeenEdge, sample: EdgeSample, val
 def motion_across(job: Job, edges: FilmEdges, steps: Steps, moving: Displacements) -> mi.Float:
     """How fast the edges move across the film, attached; value 0."""
     relative = moving.of_edge(edges.table, steps.at, steps.ω)
-    if not job.facts.camera_moves:
+    if not job.facts.view_moves:
         return dr.dot(steps.n_perp, relative)
     relative -= moving.of_camera(steps.film, steps.aperture, steps.at.x)
     return dr.dot(steps.n_perp, relative) + dr.dot(steps.turn, moving.of_view(steps.film, steps.aperture, steps.ω))
@@ -240,7 +240,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Outlines move as soon as a shape or the camera does."""
     if steps_rest(facts):
         return False, steps_rest(facts)
-    if not (facts.shapes_move or facts.camera_moves):
+    if not (facts.shapes_move or facts.view_moves):
         what = "paths bend behind glass" if facts.paths_bend else "lights without a shape move"
         return False, f"only {what}: every outline stays where it is on the film"
     return True, "outlines move over the film"

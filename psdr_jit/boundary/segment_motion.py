@@ -99,7 +99,7 @@ def _motion(job: Job, edges: SampledRows, s: BoundarySamples, moving: Displaceme
     c = s.records.data
     surface = moving.of_surface(c.hit)
     camera = mi.Float(0)
-    if job.facts.camera_moves:
+    if job.facts.view_moves:
         camera = dr.dot(c.camera, moving.of_camera(c.film, c.aperture, c.hit.o + c.hit.d * c.hit.t))
     go_on = dr.dot(c.deposit_continue, surface)
     if s.records.delta is not None:

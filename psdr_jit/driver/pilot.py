@@ -21,6 +21,7 @@ import numpy as np
 
 from ..core.film import sampled_window
 from ..core.line_guide import LEAST_GAIN, LineGuide, LineTally
+from ..options import FOLLOWING
 from ..plan.job import Job
 from .film_noise import FilmNoise, coarse
 from .terms import TERMS
@@ -40,6 +41,9 @@ LEAST, MOST = 1 / 8, 8.0
 #: From here on a guide over one random number takes more from well spread samples than it gives: it goes by their
 #: second moment, and they have much less variance than that.
 STRATIFIED = 1.1
+
+#: Time of a path from a place on the film that moves, relative to one from a place that rests.
+MOVING_PLACES = 1.3
 
 #: Between independent samples and stratified ones of a smooth function of one variable.
 SLOWEST, FASTEST = 1.0, 3.0
@@ -144,6 +148,15 @@ class Measurement:
             low, high = (middle, high) if cheap else (low, middle)
         return {**spp, **{name: max(1, round(n)) for name, n in found.items()}}
 
+    def alike(self) -> Measurement:
+        """Whose terms gain as little by more paths as in the form in which they do least: few samples tell no better,
+        and at many paths a wrong p would decide which form is chosen.
+        """
+        forms = list(self.noise.values())
+        slowest = {name: min(terms[name].p for terms in forms) for name in forms[0]}
+        return Measurement({form: {name: replace(t, p=slowest[name]) for name, t in terms.items()}
+                            for form, terms in self.noise.items()})  # fmt: skip
+
     def efficiency(self, form: str, spp: Mapping[str, int]) -> float:
         """Variance × cost with these budgets; the lower the better."""
         terms = self.noise[form].items()
@@ -170,7 +183,8 @@ def measure(
             )  # fmt: skip
             job = job_of(form, FIRST_SEED, FEW)
             dearer = term.with_light if job.light is not None else 1
-            noise = TermNoise.between(float(few.mean()), float(more.mean()), dearer * term.cost(form, sky))
+            cost = dearer * term.cost(FOLLOWING.get(form, form), sky) * (MOVING_PLACES if form in FOLLOWING else 1)
+            noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
             if term.over_film:
                 noise = noise.spread(few, more, _effort(traced, job) if traced else None)
             if traced:

@@ -18,7 +18,7 @@ from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..edges.followed_lights import followed_lights
 from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
-from ..options import FILM, Options, require_runtime, samples_per_pixel
+from ..options import FILM_MATERIAL, FOLLOWING, MATERIAL, SPATIAL, Options, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try, why_film_rests
@@ -91,7 +91,7 @@ def prepare(call: Call) -> Prepared:
 
 def _plain(q: Question, plan: Plan) -> Callable[[int], Job]:
     """Jobs of what is no term, for which places on the film rest."""
-    resting = replace(plan, form="spatial") if plan.form == FILM else plan
+    resting = replace(plan, form=FOLLOWING.get(plan.form, plan.form))
     return lambda spp: q.job(resting, spp)
 
 
@@ -133,13 +133,15 @@ def _given(options: Options) -> Plan | None:
 def _as_given(plan: Plan, q: Question) -> Plan:
     """The plan as it was given, but for terms with a budget of 0. Raises if it leaves out what is needed."""
     geometry = _geometry(q, plan.prunes)
-    fresh = decide(TERMS, q.facts, q.call.options, geometry, dict.fromkeys(q.budgets, 1))
+    fresh = decide(TERMS, q.facts_in(plan.form), q.call.options, geometry, dict.fromkeys(q.budgets, 1))
     needed = {t.name for t in fresh if t.runs}
     missing = needed - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
     missing |= _with_edges(plan, q) & needed
     film_rests = why_film_rests(q.call, q.facts)
-    if plan.form == FILM and film_rests:
-        raise OptionError(f"the given plan has the form 'film', but {film_rests}; make it anew with psdr_jit.make_plan")
+    if plan.form in FOLLOWING and film_rests:
+        raise OptionError(
+            f"the given plan has the form '{plan.form}', but {film_rests}; make it anew with psdr_jit.make_plan"
+        )
     if missing:
         raise OptionError(
             f"the given plan leaves out {', '.join(sorted(missing))}, which this derivative needs: it was made for "
@@ -185,7 +187,7 @@ def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, film_rests)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
-        terms = decide(TERMS, q.facts, call.options, geometry, spp)
+        terms = decide(TERMS, q.facts_in(form[0]), call.options, geometry, spp)
         return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
 
     plan = made(budgets, (forms[0], reason), "equal")
@@ -196,14 +198,15 @@ def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     log = call.memory[NOISE].setdefault((call.options, *_kind(q, forms), *budgets.values()), NoiseLog())
     if log.needs_pilot:
         # Terms that are switched off here as well: integrators of one term each must agree on the form.
-        names = [term.name for term in made(dict.fromkeys(budgets, 1), (forms[0], ""), "").running]
+        ones = dict.fromkeys(budgets, 1)
+        names = {term.name for form in forms for term in made(ones, (form, ""), "").running}
         log.pilot(_pilot(q, plan, forms, names, log.epoch))
     if log.current is not None and log.due:
         log.learn()
         form = _best_form(log.measured, max(budgets.values()), (forms[0], reason))
         spp, why = budgets, "equal"
         if automatic:
-            running = {term.name for term in plan.running}
+            running = {term.name for term in made(budgets, form, "").running}
             spp, why = log.current.allocate(form[0], budgets, running), BY_NOISE
         log.share = (spp, form, why)
     log.calls += 1
@@ -220,9 +223,9 @@ def _geometry(q: Question, prunes: bool) -> Geometry:
     if not q.facts.geometry_moves:
         return Geometry()
     alone = lone_convex(call.scene, call.sensor, q.facts, call.memory) if prunes else ""
-    if call.options.form == "material":
+    if call.options.form in (MATERIAL, FILM_MATERIAL):
         return Geometry(alone)
-    lights = followed_lights(q.job(Plan("spatial", "", "", (), prunes), 1))
+    lights = followed_lights(q.job(Plan(SPATIAL, "", "", (), prunes), 1))
     return Geometry(alone, "" if lights is None else lights.names[0])
 
 
@@ -233,7 +236,7 @@ def _kind(q: Question, forms: tuple[str, ...]) -> tuple:
     return (q.facts.enabled, q.facts.sensor.name, tuple(sensor.film().crop_size()), options, forms)
 
 
-def _pilot(q: Question, plan: Plan, forms: tuple[str, ...], names: list[str], epoch: int) -> Measurement:
+def _pilot(q: Question, plan: Plan, forms: tuple[str, ...], names: set[str], epoch: int) -> Measurement:
     """The pilot of this epoch; run unless an integrator with the same memory has done so."""
     found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
@@ -241,7 +244,7 @@ def _pilot(q: Question, plan: Plan, forms: tuple[str, ...], names: list[str], ep
         def job_of(form: str, seed: int, spp: int) -> Job:
             call = replace(q.call, seed=seed, counters=Counters())
             formed = replace(plan, form=form)
-            return Job(call, q.facts, formed, q.probe_of(formed), q.shared, spp)
+            return Job(call, q.facts_in(form), formed, q.probe_of(formed), q.shared, spp)
 
         found.clear()
         sky = q.call.scene.environment() is not None
@@ -254,7 +257,7 @@ def _best_form(measured: Measurement, spp: int, single: tuple[str, str]) -> tupl
 
     By the pilot alone, so that integrators of single terms, whose images are added up, agree.
     """
-    work = {}
+    work, measured = {}, measured.alike()
     for form, noise in measured.noise.items():
         even = dict.fromkeys(noise, spp)
         work[form] = measured.efficiency(form, measured.allocate(form, even, even))

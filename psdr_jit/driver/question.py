@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from ..core.line_guide import LineTally
 from ..core.memory import Memory, Slot
 from ..core.streams import other_seed
-from ..options import FILM
+from ..options import FOLLOWING
 from ..plan.call import Call
 from ..plan.film_flow import FilmFlow, FilmMotion
 from ..plan.job import Job, in_motion, surfaces_of_call
@@ -23,6 +23,8 @@ PROBE: Slot[Motion | None] = Slot(lambda: None)
 #: Of one render call: where places on its film go with the scene's motion, and with the probe's.
 FLOW: Slot[FilmFlow | None] = Slot(lambda: None)
 PROBE_FLOW: Slot[FilmFlow | None] = Slot(lambda: None)
+#: Of one render call: the facts of jobs whose places on the film move.
+FOLLOWED: Slot[SceneFacts | None] = Slot(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -44,19 +46,25 @@ class Question:
         surfaces = surfaces_of_call(self.call, self.facts, self.shared)
         film, lines = (None, None) if term is None else (term.film, term.lines)
         motion = own = SceneMotion(self.call.sensor, surfaces)
-        if plan.form == FILM:
+        if plan.form in FOLLOWING:
             motion = FilmMotion(own, self.shared.once(FLOW, lambda: self._flow_of(own)))
         # What a guide has learned from must be independent of what it draws, also if a seed comes back.
         call = self.call if lines is None else replace(self.call, seed=other_seed(self.call.seed, lines.key))
         probe = self.probe_of(plan) if tally is not None and call.mode == "backward" else None
-        return Job(call, self.facts, plan, motion, self.shared, spp, film, lines, tally, probe)
+        return Job(call, self.facts_in(plan.form), plan, motion, self.shared, spp, film, lines, tally, probe)
+
+    def facts_in(self, form: str) -> SceneFacts:
+        """What a job of this form is told of the scene."""
+        if form not in FOLLOWING:
+            return self.facts
+        return self.shared.once(FOLLOWED, lambda: replace(self.facts, places_move=True))
 
     def _flow_of(self, motion: Motion) -> FilmFlow:
         return FilmFlow.of(self.call.scene, self.call.sensor, self.call.film, motion)
 
     def probe_of(self, plan: Plan) -> Motion:
         """The motion of everything that can move, as the plan's form has it: seen from places that follow, or rest."""
-        if plan.form != FILM:
+        if plan.form not in FOLLOWING:
             return self.probe
         return FilmMotion(self.probe, self.shared.once(PROBE_FLOW, self._probe_flow))
 

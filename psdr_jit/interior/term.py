@@ -52,7 +52,7 @@ def every_path_differs(job: Job) -> bool:
     """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
     facts = job.facts
     emission = any(e.pose or e.radiance for e in facts.emitters)
-    return facts.camera_moves or emission or _area_lights_change(facts) or not job.plan.prunes
+    return facts.view_moves or emission or _area_lights_change(facts) or not job.plan.prunes
 
 
 def _area_lights_change(facts: SceneFacts) -> bool:
@@ -162,7 +162,7 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
     if dr.width(lane) == 0:
         return p.develop(job.film, dL)
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-    if job.facts.camera_moves:
+    if job.facts.view_moves:
         o_grad, d_grad = _camera_tangents(job, p)
         o_grad = o_grad + _skipped(job, p, records) * d_grad
     recorded, L = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
@@ -224,7 +224,7 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
         return
     δL = dr.gather(mi.Spectrum, share * p.adjoint(job.film, grad_in), lane)
     λ_o, λ_d, L = backward_sweep(records, δL, flow_of(job), job.motion)
-    if job.facts.camera_moves:
+    if job.facts.view_moves:
         λ_d = λ_d + _skipped(job, p, records) * λ_o
         # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
         dr.eval(λ_o, λ_d, *([] if job.film_flow is None else [L]))
@@ -241,6 +241,8 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Whatever depends on θ changes paths or what they carry."""
+    if facts.places_move:
+        return True, f"places on the film follow what is seen, and {what_changes(facts)} change"
     if options.depth_limit == 1:
         radiance = any(e.radiance or e.pose for e in facts.emitters)
         emitting = any(s.is_emitter and s.shading for s in facts.shapes)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..core.sensor_frame import KINDS
-from ..options import FILM, Options
+from ..options import FOLLOWING, MATERIAL, SPATIAL, Options
 from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts
 from .call import Call
@@ -31,25 +31,27 @@ def forms_to_try(
     `film_rests`: see `why_film_rests`.
     """
     if facts.geometry_moves and facts.has_delta_lobes:
-        return ("spatial",), "directions follow mirrors and glass"
+        return (SPATIAL,), "directions follow mirrors and glass"
     # points of a B-spline are followed, but not as its texture coordinates turn about its axis
     unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL or (s.kind == "curve" and s.patterns)]
     if facts.geometry_moves and unmapped:
-        return ("spatial",), f"the points of '{unmapped[0]}' are not followed"
-    if options.form == FILM and film_rests:
-        return ("spatial",), film_rests
+        return (SPATIAL,), f"the points of '{unmapped[0]}' are not followed"
+    if options.form in FOLLOWING and film_rests:
+        return (SPATIAL,), film_rests
     if options.form != "auto":
         return (options.form,), "as asked for"
     forms, reason = _of_vertices(scene, facts, options, geometry)
-    if film_rests or not any(shape.painted for shape in facts.shapes):  # else it has more noise, not less
+    followed = (shape for shape in facts.shapes if facts.camera_moves or shape.moves)
+    if film_rests or not any(shape.painted for shape in followed):  # else it has more noise, not less
         return forms, reason
-    return (*forms, FILM), NOTHING_TO_COMPARE
+    following = {vertices: form for form, vertices in FOLLOWING.items()}
+    return (*forms, following[forms[-1]]), NOTHING_TO_COMPARE
 
 
 def why_film_rests(call: Call, facts: SceneFacts) -> str:
     """Why places on the film cannot follow what is seen; "" if they can."""
-    if not facts.camera_moves:
-        return "the camera rests, and so do places on the film"
+    if not (facts.camera_moves or facts.shapes_move):
+        return "camera and shapes rest, and so do places on the film"
     if call.sensor.class_name() not in KINDS:
         return f"places on the film of a '{call.sensor.class_name()}' are not followed"
     if call.film.rfilter().is_box_filter():
@@ -66,15 +68,15 @@ def _of_vertices(
 ) -> tuple[tuple[str, ...], str]:
     """The forms that differ in what path vertices do."""
     if not facts.geometry_moves:
-        return ("spatial",), "nothing moves, so the forms are the same"
+        return (SPATIAL,), "nothing moves, so the forms are the same"
     if options.depth_limit < 3:
-        return ("spatial",), "light is scattered once at most, so the forms are the same"
+        return (SPATIAL,), "light is scattered once at most, so the forms are the same"
     if geometry.touched_lamp:
-        return ("spatial",), f"'{geometry.touched_lamp}' touches what it shines on"
+        return (SPATIAL,), f"'{geometry.touched_lamp}' touches what it shines on"
     touching = _touching(scene, facts)
     if touching:
-        return ("spatial",), f"{touching} touch and move against each other"
-    return ("spatial", "material"), NOTHING_TO_COMPARE
+        return (SPATIAL,), f"{touching} touch and move against each other"
+    return (SPATIAL, MATERIAL), NOTHING_TO_COMPARE
 
 
 def _touching(scene: mi.Scene, facts: SceneFacts) -> str:

@@ -26,7 +26,7 @@ def film_weights(job: Job) -> list[mi.Float]:
     table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
     weights = table.weights(lambda kind: kind.film_weights(job.frame, border))
-    if job.facts.camera_moves or not job.plan.prunes:
+    if job.facts.view_moves or not job.plan.prunes:
         return weights
     return [dr.select(moves, w, 0) for w, moves in zip(weights, table.moving(), strict=True)]
 

@@ -62,8 +62,8 @@ class Movers:
         return self.seen.seen_from(x)
 
 
-#: Of one render call: what moves, by what lines through edges are drawn for.
-MOVERS: Slot[dict[Use, Movers | None]] = Slot(dict)
+#: Of one render call: what moves, by what lines through edges are drawn for and whether camera rays move.
+MOVERS: Slot[dict[tuple[Use, bool], Movers | None]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -140,17 +140,17 @@ def movers_of(job: Job, use: Use) -> Movers | None:
 
     None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves.
     """
-    known = job.shared[MOVERS]
-    if use not in known:
-        known[use] = _found_movers(job, use)
-    return known[use]
+    known, which = job.shared[MOVERS], (use, job.facts.view_moves)
+    if which not in known:
+        known[which] = _found_movers(job, use)
+    return known[which]
 
 
 def _found_movers(job: Job, use: Use) -> Movers | None:
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]
-    everywhere = facts.camera_moves or facts.paths_bend or (use is Use.SHADOW and light_moves)
+    everywhere = facts.view_moves or facts.paths_bend or (use is Use.SHADOW and light_moves)
     if everywhere or not moving or not job.plan.prunes:
         return None
     shapes = job.scene.shapes()

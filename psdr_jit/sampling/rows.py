@@ -69,9 +69,13 @@ STATES: Slot[dict[str, Any]] = Slot(dict)
 #: Of an integrator.
 ROW_SAMPLER: Slot[RowSampler] = Slot(WeightedRows)
 
+#: What samplers know rows by whose steps are seen from places on the film that move.
+FOLLOWED = "followed"
+
 
 def row_state(job: Job, what: str, weights: Callable[[], list[mi.Float]]) -> Any | None:
     """The sampler's state for `what`, fixed for the render call. None if nothing can contribute."""
+    what = f"{what} {FOLLOWED}" if job.facts.places_move else what  # where what rests on the film matters as well
     states = job.shared[STATES]
     if what not in states:
         states[what] = job.call.memory[ROW_SAMPLER].init(what, weights())

@@ -110,6 +110,7 @@ class SceneFacts:
     extent: float  # diagonal of the scene's bounding box [scene units], 0 without shapes
     reach: float  # largest coordinate of that box [scene units]
     still: str = ""  # why nothing counts as enabled though gradients are
+    places_move: bool = False  # places on the film follow what is seen there, whatever the camera does
 
     @property
     def anything_enabled(self) -> bool:
@@ -118,6 +119,10 @@ class SceneFacts:
     @property
     def camera_moves(self) -> bool:
         return bool(self.sensor.pose)
+
+    @property
+    def view_moves(self) -> bool:
+        return self.camera_moves or self.places_move
 
     @cached_property
     def shapes_move(self) -> bool:
