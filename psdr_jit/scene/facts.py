@@ -120,9 +120,7 @@ class SceneFacts:
     def camera_moves(self) -> bool:
         return bool(self.sensor.pose)
 
-    @property
-    def view_moves(self) -> bool:
-        return self.camera_moves or self.places_move
+    view_moves = property(lambda self: self.camera_moves or self.places_move)  # do camera rays move?
 
     @cached_property
     def shapes_move(self) -> bool:
