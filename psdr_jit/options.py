@@ -20,6 +20,12 @@ FOLLOWING = {FILM: SPATIAL, FILM_MATERIAL: MATERIAL}
 
 FORMS = (SPATIAL, MATERIAL, *FOLLOWING)
 
+
+def of_vertices(form: str) -> str:
+    """What path vertices do in a form, wherever places on the film are: SPATIAL or MATERIAL."""
+    return FOLLOWING.get(form, form)
+
+
 #: Leave out what does not contribute, or compute everything, for comparison.
 PLANS = ("lean", "full")
 

@@ -191,7 +191,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
         return False, NOTHING_SCATTERS
     if geometry.lone_convex:
         return False, f"'{geometry.lone_convex}' is alone and convex: it sees nothing but the sky"
-    if not (facts.shapes_move or facts.view_moves or facts.paths_bend):
+    if not (facts.shapes_move or facts.camera_moves or facts.paths_bend):
         return False, "only lights without a shape move: what surfaces see of each other stays the same"
     return True, "what surfaces see of each other moves"
 

@@ -240,7 +240,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
     """Outlines move as soon as a shape or the camera does."""
     if steps_rest(facts):
         return False, steps_rest(facts)
-    if not (facts.shapes_move or facts.view_moves):
+    if not (facts.shapes_move or facts.camera_moves):
         what = "paths bend behind glass" if facts.paths_bend else "lights without a shape move"
         return False, f"only {what}: every outline stays where it is on the film"
     return True, "outlines move over the film"

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core.film import sampled_window
 from ..core.line_guide import LEAST_GAIN, LineGuide, LineTally
-from ..options import FOLLOWING
+from ..options import FOLLOWING, of_vertices
 from ..plan.job import Job
 from .film_noise import FilmNoise, coarse
 from .terms import TERMS
@@ -183,7 +183,7 @@ def measure(
             )  # fmt: skip
             job = job_of(form, FIRST_SEED, FEW)
             dearer = term.with_light if job.light is not None else 1
-            cost = dearer * term.cost(FOLLOWING.get(form, form), sky) * (MOVING_PLACES if form in FOLLOWING else 1)
+            cost = dearer * term.cost(of_vertices(form), sky) * (MOVING_PLACES if form in FOLLOWING else 1)
             noise = TermNoise.between(float(few.mean()), float(more.mean()), cost)
             if term.over_film:
                 noise = noise.spread(few, more, _effort(traced, job) if traced else None)

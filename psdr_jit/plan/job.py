@@ -15,7 +15,7 @@ from ..core.line_guide import LineGuide, LineTally
 from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..core.varying import varying
-from ..options import FOLLOWING, Options
+from ..options import Options, of_vertices
 from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.edge_on import EdgeOn
 from ..paths.light_technique import LightTechnique
@@ -102,7 +102,7 @@ class Job:
     @property
     def form(self) -> str:
         """What path vertices do while θ changes, "spatial" or "material"."""
-        return FOLLOWING.get(self.plan.form, self.plan.form)
+        return of_vertices(self.plan.form)
 
     @property
     def film_flow(self) -> FilmFlow | None:

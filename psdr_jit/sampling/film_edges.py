@@ -22,7 +22,7 @@ class FilmEdges(SampledRows):
 
 
 def film_weights(job: Job) -> list[mi.Float]:
-    """By kind of edge, the weight of each row: of moving shapes, or of all if the camera moves."""
+    """By kind of edge, the weight of each row: of moving shapes, or of all if camera rays move."""
     table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
     weights = table.weights(lambda kind: kind.film_weights(job.frame, border))

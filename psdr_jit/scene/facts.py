@@ -120,7 +120,10 @@ class SceneFacts:
     def camera_moves(self) -> bool:
         return bool(self.sensor.pose)
 
-    view_moves = property(lambda self: self.camera_moves or self.places_move)  # do camera rays move?
+    @property
+    def view_moves(self) -> bool:
+        """Camera rays move."""
+        return self.camera_moves or self.places_move
 
     @cached_property
     def shapes_move(self) -> bool:
@@ -178,9 +181,7 @@ class SceneFacts:
                 f"{listed(s.geometry)}; shading {listed(s.shading)}; material {listed(s.material)}"
             )
         for e in self.emitters:
-            lines.append(
-                f"emitter {e.name} ({e.plugin}): pose {listed(e.pose)}; radiance {listed(e.radiance)}"
-            )
+            lines.append(f"emitter {e.name} ({e.plugin}): pose {listed(e.pose)}; radiance {listed(e.radiance)}")
         return "\n".join(lines)
 
 
@@ -207,9 +208,7 @@ def analyse(
         return SceneFacts(
             variant=mi.variant(),
             polarized=mi.is_polarized,
-            shapes=tuple(
-                _shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)
-            ),
+            shapes=tuple(_shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)),
             emitters=tuple(
                 emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
             ),
