@@ -53,7 +53,7 @@ from ..scene.facts import SceneFacts
 from . import segment_motion
 from .horizons import LIGHTS as HORIZONS
 from .horizons import shared_out
-from .lifted_receiver import Landing, lifted_receiver
+from .lifted_receiver import Landing, ends_in_a_crease, lifted_receiver
 from .light_horizons import LIGHT_HORIZONS
 from .light_lines import LightLine, sample_light_lines
 from .light_steps import BORNE
@@ -139,6 +139,9 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     active &= met.pi.is_valid() & ((on.aside == 0) | (met.pi.t - on.lead > on.offset))
     receiver, above, found = lifted_receiver(job, met, on.x, active)
     active &= found
+    if job.facts.has_delta_emitters:
+        face = edges.table.face_along(line.row, light.ω)
+        active &= ~ends_in_a_crease(job, met, on, light.n_perp, face, active)
     r = dr.maximum(met.pi.t - on.lead - above, 0)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)

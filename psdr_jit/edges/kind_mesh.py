@@ -141,6 +141,10 @@ class MeshEdges(BetweenFaces):
         into = dr.normalize(dr.cross(rows.n0, rows.p1 - rows.p0))
         return dr.select(rows.border & ~rows.traced, sight.at.x + sight.lead * into, self.aim(row, sight, active))
 
+    def face_along(self, row: mi.UInt32, ω: mi.Vector3f, active: mi.Bool) -> mi.Normal3f:
+        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        return dr.select(dr.abs(dr.dot(n0, ω)) < dr.abs(dr.dot(n1, ω)), n0, n1)
+
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """A point of face 0 or 1 next to the edge, as if the viewer had looked at it."""
         corners = dr.select(use1, rows.corner1, rows.corner0)

@@ -141,6 +141,24 @@ def test_the_shadow_of_a_box_lit_along_its_faces(llvm, lamp):
         assert_alike(scene, nearby)
 
 
+@pytest.mark.parametrize("lean", [-20, -5, 0, 20])
+def test_the_foot_of_a_box_lit_along_its_faces(llvm, lean):
+    """The shadow of a face ends where the face cuts into the floor: camera rays see one step there, not two.
+
+    The light turns past the plane of the face, which overhangs, stands upright or leans back.
+    """
+    camera = perspective((4, 1.5, 1), (0.7, 0, 0))
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(3), "bsdf": {"type": "diffuse"}}
+    box = {"type": "cube", "to_world": T().rotate([0, 0, 1], lean).scale([0.5, 0.5, 0.4]), "bsdf": {"type": "diffuse"}}
+    images = []
+    for aside in (-FURTHER, FURTHER):
+        sun = T().rotate([0, 0, 1], lean + np.rad2deg(aside)).rotate([1, 0, 0], 90 + 20)
+        lamp = {"type": "directional", "to_world": sun}
+        scene = scene_of(camera, box=box, floor=floor, lamp=lamp)
+        images.append(forward(perturb(scene, "camera.to_world", DIRECTION), SPEC, 4, 256).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.01 * np.linalg.norm(images[1])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("heights", [(0.0, -1e-3), (4e-4, 2e-3)])
 def test_a_face_of_a_mirror_that_is_barely_seen(llvm, heights):
