@@ -126,7 +126,8 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     on_surface = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Surface)
     start = on.x + on.offset * light.n_perp + on.lead * light.ω
     up = mi.Ray3f(start, light.ω, 0, line.wavelengths)
-    up.maxt = dr.select(on_surface, dr.inf, light.dist - on.lead)
+    # Rays to a point light end a little before it, as Mitsuba's do: it may lie on a surface.
+    up.maxt = dr.select(on_surface, dr.inf, (1 - SHADOW_EPSILON) * light.dist - on.lead)
     pi = scene.ray_intersect_preliminary(up, coherent=False, active=active)
     reached = pi.is_valid() & (pi.shape.emitter() == light.emitter)
     reached &= dr.abs(pi.t + on.lead - light.dist) < SHADOW_EPSILON * light.dist  # not another sheet of the emitter

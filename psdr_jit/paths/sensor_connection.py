@@ -28,18 +28,27 @@ def seen_by_sensor(
     """Is nothing between the start of its viewing ray and `si`? Hidden emitters are transparent, and not seen.
 
     As camera rays see it, from which no height above the surface is left out: next to an outline, or below something
-    thin, another point is hidden from that height.
+    thin, another point is hidden from that height. The inner wall of a ball or a tube, next to its outline, is as close
+    behind the outer one as one likes: there, the ray ends a little off the wall, on the side that is seen.
     """
     cos = dr.maximum(dr.abs(dr.dot(si.n, view.ω)), LEAST_COSINE)
     height = start_height(si.p)
-    ray = mi.Ray3f(view.o, view.ω)
-    ray.maxt = view.r - (TOUCHES * height + ROUNDING * view.r) / cos
+    round_ = has_two_walls(si.shape)
+    off = si.p - dr.mulsign(TOUCHES * height, dr.dot(si.n, view.ω)) * si.n - view.o
+    ray = mi.Ray3f(view.o, dr.select(round_, dr.normalize(off), view.ω))
+    ray.maxt = dr.select(round_, dr.norm(off), view.r - (TOUCHES * height + ROUNDING * view.r) / cos)
     if hide_emitters:
         active = active & (si.shape.emitter() == None)  # noqa: E711 (an array comparison)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     if hide_emitters:
         _, pi = see_through_emitters(scene, ray, pi)
     # What is met may be the surface itself: where a large face is, is rounded.
-    itself = (pi.shape == si.shape) & (pi.prim_index == si.prim_index)
+    itself = (pi.shape == si.shape) & (pi.prim_index == si.prim_index) & ~round_
     itself &= pi.t >= view.r * (1 - SHADOW_EPSILON) - height / cos
     return active & (~pi.is_valid() | itself)
+
+
+def has_two_walls(shape: mi.ShapePtr) -> mi.Bool:
+    """May a ray meet one primitive of the shape twice?"""
+    kind = shape.shape_type()
+    return (kind == mi.UInt32(mi.ShapeType.Sphere)) | (kind == mi.UInt32(mi.ShapeType.Cylinder))

@@ -154,3 +154,18 @@ def test_a_shape_that_moves(llvm, name, kind, depth):
 @pytest.mark.parametrize("name, kind, depth", [case for case in CASES if case[0] != "ball"])  # it stays as it is
 def test_a_shape_that_turns(llvm, name, kind, depth):
     assert_agrees(name, kind, depth, "shape", TURN, 4096, rotate=(0.3, 1, 0))
+
+
+def test_the_outer_wall_hides_the_inner_one(llvm):
+    """Light from above ends on the inner wall of an upright tube, along a line that passes behind both its outlines:
+    as close behind the outer wall as one likes, and never seen from the side."""
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}, "pixel_format": "luminance"}
+    pose = mi.ScalarTransform4f().look_at(origin=[0.3, -4, 0.1], target=[0, 0, 0], up=[0, 0, 1])
+    scene = mi.load_dict({
+        "type": "scene", "camera": {"type": "perspective", "fov": 30, "to_world": pose, "film": film},
+        "tube": {"type": "cylinder", "p0": [0, 0, -0.7], "p1": [0, 0, 0.7], "radius": 0.6, "bsdf": TWO_SIDED},
+        "lamp": {"type": "point", "position": [1.3, -1.5, 2.5], "intensity": 20.0},
+    }, optimize=False)  # fmt: skip
+    motion = perturb(scene, "camera.to_world", direction=(1, 0.3, 0.2))
+    shadows = {"type": "psdr_path", "max_depth": 2, "sppc": 0, "sppp": 0}
+    assert not forward(motion, shadows, 1, 1024).any()

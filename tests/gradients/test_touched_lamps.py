@@ -128,3 +128,16 @@ def test_a_lamp_in_a_window_is_named(mono):
             warnings.simplefilter("always")
             psdr_jit.make_plan(scene, ["camera.to_world"], integrator={"type": "psdr_path", "max_depth": 2})
         assert any("cuts into 'floor', behind which it is seen" in str(w.message) for w in said) == named
+
+
+def test_a_point_light_on_a_surface(llvm):
+    """It casts shadows like one that hangs a little below: Mitsuba's shadow rays end before what it lies on."""
+    images = []
+    for gap in (0.0, 0.02):
+        above = mi.ScalarTransform4f().translate([0.3, 2, 0.4]).rotate([1, 0, 0], 90)
+        ceiling = {"type": "rectangle", "to_world": above}
+        bulb = {"type": "point", "position": [0.3, 2 - gap, 0.4], "intensity": 5.0}
+        scene = room(ceiling | {"bsdf": {"type": "diffuse", "reflectance": 0}}, block=block(0.2), bulb=bulb)
+        motion = perturb(scene, "camera.to_world", direction=(1, 0.3, 0.2))
+        images.append(forward(motion, {"type": "psdr_path", "max_depth": 2, "sppc": 0, "sppp": 0}, 4, 256).mean(0))
+    assert np.linalg.norm(images[0] - images[1]) < 0.1 * np.linalg.norm(images[1])
