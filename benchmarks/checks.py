@@ -3,6 +3,7 @@
     python -m benchmarks.checks                   (an hour; append to benchmarks/results/checks.jsonl)
     python -m benchmarks.checks --only cbox       (cases whose name contains a word)
     python -m benchmarks.checks --missing         (cases without a row that passed)
+    python -m benchmarks.checks --list smooth     (instead, one of the lists of `check_lists`; hours on two cores)
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import rows
+from benchmarks.check_lists import LISTS
+from benchmarks.check_lists.common import Listed
 from psdr_jit import check_gradient
+from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.scene import io as scene_io
 
 BENCH = "checks"
@@ -70,17 +74,28 @@ CASES = (
 )
 
 
-def check(case: Case, seconds: float) -> dict[str, Any]:
+def load(case: Case | Listed) -> tuple[Perturbation, dict[str, Any]]:
+    """The motion of a case in its scene, and what `check_gradient` and a row are told of it."""
+    if isinstance(case, Listed):
+        scene, how = case.scene(), case.motion
+        told = {"eps": how.eps, "tolerance": case.tolerance, "max_stderr": case.stderr}
+        return perturb(scene, how.param, how.direction, rotate=how.rotate), told
     scene = scene_io.load_scene(scene_io.shipped_scene(f"{case.scene}.xml"), **case.load)
-    found = check_gradient(
-        scene, case.param, case.direction, rotate=case.rotate, eps=case.eps, max_stderr=STDERR, max_seconds=seconds
-    )
+    motion = perturb(scene, case.param, case.direction, rotate=case.rotate)
+    return motion, {"eps": case.eps, "max_stderr": STDERR}
+
+
+def check(case: Case | Listed, seconds: float, **samples: int) -> dict[str, Any]:
+    """A row; `samples`: `spp` and `reference_spp` of `check_gradient`."""
+    motion, told = load(case)
+    found = check_gradient(motion.scene, motion, max_seconds=seconds, **told, **samples)
     v = found.verdict
-    film = scene.sensors()[0].film().crop_size()
+    film = motion.scene.sensors()[0].film().crop_size()
+    shipped = {} if isinstance(case, Listed) else {"scene": case.scene}
     settings = {
-        "scene": case.scene, "parameter": case.param, "motion": found.direction, "res": int(film[0]), "spp": found.spp,
+        **shipped, "parameter": motion.name, "motion": found.direction, "res": int(film[0]), "spp": found.spp,
         "seeds": found.seeds, "reference_spp": found.reference_spp, "reference_seeds": found.reference_seeds,
-        "eps": found.eps, "block": found.block, **case.load,
+        "eps": found.eps, "block": found.block, **({} if isinstance(case, Listed) else case.load),
     }  # fmt: skip
     return {
         "bench": BENCH, "case": case.name, "method": "psdr_path", "settings": settings, "verdict": v.verdict,
@@ -98,6 +113,10 @@ def passed(path: Path) -> set[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", metavar="WORD", help="cases whose name contains it")
+    parser.add_argument("--list", choices=LISTS, help="cases of this list")
+    parser.add_argument("--share", default="0/1", metavar="I/N", help="every Nth case, from the Ith on (default: 0/1)")
+    parser.add_argument("--spp", type=int, default=64, help="of the estimate (default: 64)")
+    parser.add_argument("--reference-spp", type=int, help="of differences (default: as the check sees fit)")
     parser.add_argument("--missing", action="store_true", help="leave out what has a row that passed")
     parser.add_argument("--seconds", type=float, default=180, help="time limit of a case (default: 180)")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
@@ -105,14 +124,16 @@ def main() -> int:
     args = parser.parse_args()
     scene_io.use_variant(args.variant)
     done = passed(args.out) if args.missing else set()
+    cases = list(LISTS[args.list]()) if args.list else list(CASES)
+    first, step = (int(word) for word in args.share.split("/"))
     failed = 0
-    for case in CASES:
+    for case in cases[first::step]:
         if args.only in case.name and case.name not in done:
-            row = check(case, args.seconds)
+            row = check(case, args.seconds, spp=args.spp, reference_spp=args.reference_spp)
             rows.append(args.out, {**row, **rows.circumstances()})
             failed += row["verdict"] != "pass"
             print(
-                f"{case.name:32s} {row['verdict']:12s} gain {row['gain']:.4f} +- {row['gain_stderr']:.4f}  RMS z "
+                f"{case.name:48s} {row['verdict']:12s} gain {row['gain']:.4f} +- {row['gain_stderr']:.4f}  RMS z "
                 f"{row['rms_z']:.2f}  max |z| {row['max_z']:.1f}  {row['seconds']:.0f} s  {row['reason']}",
                 flush=True,
             )

@@ -82,6 +82,14 @@ def smooth_mesh(name: str, points: np.ndarray, faces: np.ndarray, bsdf: Any) -> 
     return _filled(mesh, points, faces)
 
 
+def smooth_light(name: str, points: np.ndarray, faces: np.ndarray, emitter: Any) -> Any:
+    """A smooth-shaded Mitsuba mesh that emits."""
+    props = mi.Properties()
+    props["emitter"] = emitter
+    mesh = mi.Mesh(name, len(points), len(faces), has_vertex_normals=True, props=props)
+    return _filled(mesh, points, faces)
+
+
 def _props(bsdf: Any, face_normals: bool) -> Any:
     props = mi.Properties()
     props["bsdf"], props["face_normals"] = bsdf, face_normals

@@ -1,0 +1,117 @@
+"""Smooth-shaded meshes × materials × motions × path lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from benchmarks import meshes
+from benchmarks.check_lists.common import (
+    POINT,
+    Listed,
+    Motion,
+    T,
+    ground,
+    lamp,
+    moved,
+    scene_of,
+    turned,
+    unit,
+    view,
+)
+
+EYE, TARGET = (0.9, 1.4, 5.2), (0.1, -0.2, 0)
+VERTEX_STEP = 0.01  # of differences, in edges of the mesh
+
+
+def round_mesh(segments: int) -> tuple[np.ndarray, np.ndarray]:
+    """A ball about the origin, its poles a little tilted."""
+    points, faces = meshes.ball(segments // 2, segments)
+    return leant((points - meshes.CENTRE) / meshes.RADIUS), faces
+
+
+def torus() -> tuple[np.ndarray, np.ndarray]:
+    """48 segments along the ring, 24 around the tube."""
+    n, m = 48, 24
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(m), indexing="ij"))
+    φ, θ = 2 * np.pi * i / n, 2 * np.pi * j / m
+    radius = 0.75 + 0.3 * np.cos(θ)
+    points = np.stack([radius * np.cos(φ), radius * np.sin(φ), 0.3 * np.sin(θ)], -1)
+    right, up = (i + 1) % n, (j + 1) % m
+    a, b, c, d = (u * m + v for u, v in ((i, j), (right, j), (right, up), (i, up)))
+    return leant(points), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def bumpy() -> tuple[np.ndarray, np.ndarray]:
+    """A subdivided body with dents."""
+    points, faces = meshes.ball(32, 64)
+    unit = (points - meshes.CENTRE) / meshes.RADIUS
+    φ = np.arctan2(unit[:, 2], unit[:, 0])
+    dents = 1 + 0.18 * np.sin(3 * φ) * (1 - unit[:, 1] ** 2) + 0.1 * np.cos(5 * unit[:, 1])
+    return leant(0.8 * dents[:, None] * unit), faces
+
+
+def leant(points: np.ndarray) -> np.ndarray:
+    turn = np.array(T().rotate(unit(0.3, 0.2, 1), 23).rotate(unit(1, 0.1, 0), 38).matrix)[:3, :3]
+    return points @ turn.T
+
+
+MESHES = {
+    "ball of 16": partial(round_mesh, 16),
+    "ball of 64": partial(round_mesh, 64),
+    "ball of 200": partial(round_mesh, 200),
+    "torus": torus,
+    "bumpy body": bumpy,
+}
+#: Material, and the path lengths at which it does something else.
+MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
+    "light": ({"type": "diffuse"}, (1, 2)),
+    "diffuse": ({"type": "diffuse"}, (2, 3)),
+    "rough metal": ({"type": "roughconductor", "alpha": 0.3}, (2, 3)),
+    "rough glass": ({"type": "roughdielectric", "alpha": 0.3}, (3,)),
+}
+
+
+def smooth_scene(mesh: str, material: str, depth: int) -> mi.Scene:
+    points, faces = MESHES[mesh]()
+    bsdf = mi.load_dict(MATERIALS[material][0])
+    shape = meshes.smooth_mesh("shape", points, faces, bsdf)
+    if material == "light":
+        shape = meshes.smooth_light("shape", points, faces, mi.load_dict({"type": "area", "radiance": 2.0}))
+    lights = {} if material == "light" else {"lamp": lamp((1.9, 3.2, 2.3), 0.5, 18), "point": POINT}
+    return scene_of(depth, view(EYE, TARGET), shape=shape, floor=ground(-1.3), **lights)
+
+
+def smooth() -> Iterator[Listed]:
+    positions = "shape.vertex_positions"
+    for mesh in MESHES:
+        motions = {
+            "moved": moved(positions),
+            "turned": turned(positions),
+            "vertex": one_vertex(mesh),
+            "camera": moved("camera.to_world"),
+        }
+        for material, (_, depths) in MATERIALS.items():
+            for how, motion in motions.items():
+                for depth in depths:
+                    scene = partial(smooth_scene, mesh, material, depth)
+                    yield Listed(f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
+
+
+def one_vertex(mesh: str) -> Motion:
+    """The vertex that is farthest to the upper right in the view, outwards: on the outline.
+
+    The finer the mesh, the more a step turns the normals around it.
+    """
+    points, faces = MESHES[mesh]()
+    forward = np.subtract(TARGET, EYE) / np.linalg.norm(np.subtract(TARGET, EYE))
+    across = np.cross(forward, [-0.6, 0.8, 0])  # to the right and up
+    seen = points - EYE
+    k = np.argmax((seen @ across) / (seen @ forward))
+    edge = np.linalg.norm(points[faces[:, 0]] - points[faces[:, 1]], axis=1).mean()
+    direction = np.zeros_like(points)
+    direction[k] = points[k] / np.linalg.norm(points[k])
+    return Motion("shape.vertex_positions", VERTEX_STEP * edge, direction)
