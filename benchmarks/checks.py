@@ -22,6 +22,7 @@ from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.scene import io as scene_io
 
 BENCH = "checks"
+LISTED = "check_lists"  # the same of the rows of lists
 #: Standard error of the gain at which a case is decided; the rule asks for 0.007.
 STDERR = 0.0068
 
@@ -91,14 +92,17 @@ def check(case: Case | Listed, seconds: float, **samples: int) -> dict[str, Any]
     found = check_gradient(motion.scene, motion, max_seconds=seconds, **told, **samples)
     v = found.verdict
     film = motion.scene.sensors()[0].film().crop_size()
-    shipped = {} if isinstance(case, Listed) else {"scene": case.scene}
+    if isinstance(case, Listed):
+        bench, about = LISTED, {"list": case.of, "max_stderr": case.stderr}
+    else:
+        bench, about = BENCH, {"scene": case.scene, **case.load}
     settings = {
-        **shipped, "parameter": motion.name, "motion": found.direction, "res": int(film[0]), "spp": found.spp,
+        **about, "parameter": motion.name, "motion": found.direction, "res": int(film[0]), "spp": found.spp,
         "seeds": found.seeds, "reference_spp": found.reference_spp, "reference_seeds": found.reference_seeds,
-        "eps": found.eps, "block": found.block, **({} if isinstance(case, Listed) else case.load),
+        "eps": found.eps, "block": found.block,
     }  # fmt: skip
     return {
-        "bench": BENCH, "case": case.name, "method": "psdr_path", "settings": settings, "verdict": v.verdict,
+        "bench": bench, "case": case.name, "method": "psdr_path", "settings": settings, "verdict": v.verdict,
         "reason": v.reason, "gain": v.gain, "gain_stderr": v.gain_stderr, "rms_z": v.rms_z, "max_z": v.max_z,
         "blocks": v.blocks, "seconds": found.seconds,
     }  # fmt: skip
@@ -120,17 +124,18 @@ def main() -> int:
     parser.add_argument("--missing", action="store_true", help="leave out what has a row that passed")
     parser.add_argument("--seconds", type=float, default=180, help="time limit of a case (default: 180)")
     parser.add_argument("--variant", default=scene_io.DEFAULT_VARIANT)
-    parser.add_argument("--out", type=Path, default=rows.RESULTS / f"{BENCH}.jsonl")
+    parser.add_argument("--out", type=Path, help="default: a file of benchmarks/results")
     args = parser.parse_args()
+    out = args.out or rows.RESULTS / f"{LISTED if args.list else BENCH}.jsonl"
     scene_io.use_variant(args.variant)
-    done = passed(args.out) if args.missing else set()
-    cases = list(LISTS[args.list]()) if args.list else list(CASES)
+    done = passed(out) if args.missing else set()
+    cases: list[Case | Listed] = list(LISTS[args.list]() if args.list else CASES)
     first, step = (int(word) for word in args.share.split("/"))
     failed = 0
     for case in cases[first::step]:
         if args.only in case.name and case.name not in done:
             row = check(case, args.seconds, spp=args.spp, reference_spp=args.reference_spp)
-            rows.append(args.out, {**row, **rows.circumstances()})
+            rows.append(out, {**row, **rows.circumstances()})
             failed += row["verdict"] != "pass"
             print(
                 f"{case.name:48s} {row['verdict']:12s} gain {row['gain']:.4f} +- {row['gain_stderr']:.4f}  RMS z "

@@ -67,7 +67,9 @@ def readme_charts(found: list[dict[str, Any]]) -> str:
     shown = [row for name in (*makers, "public_scenes") for row in of.get(name, ())]
     if not blocks:
         return EMPTY
-    places = [sentences.machines(shown), sentences.on_cuda(stored_rows(rows.RESULTS / CUDA))]
+    on_cuda = stored_rows(rows.RESULTS / CUDA)
+    places = [sentences.machines(shown), sentences.on_cuda(on_cuda)]
+    places.append(sentences.lists_words([row for row in on_cuda if row["bench"] == "check_lists"]))
     return "\n\n".join(blocks) + "\n" + " ".join(filter(None, places))
 
 
@@ -104,6 +106,8 @@ def sections(of: dict[str, list[dict[str, Any]]], folder: Path) -> list[tuple[st
             timing_table([row for row in passes if "wall_ms" in row]), QUARTILES)),
         ("Workers", of.get("scaling"), lambda: (SCALING, scaling_table(of["scaling"]))),
         ("Checks against finite differences", of.get("checks"), lambda: (check_table(of["checks"]),)),
+        ("Lists of checks, every row", of.get("check_lists"), lambda: (
+            sentences.lists_words(of["check_lists"]), check_table(of["check_lists"]))),
         ("Convergence", of.get("convergence"), lambda: (convergence_table(of["convergence"]),)),
         ("Scenes by others, every row", public, lambda: (
             survey_tables.sentence(public), survey_tables.undecided_words(public), survey_tables.table(public))),

@@ -102,6 +102,28 @@ def machines(rows: list[dict[str, Any]]) -> str:
     return f"Measured {when} on {' and '.join(places)}."
 
 
+def has_signal(row: Row) -> bool:
+    """Could differences tell the derivative of a check from zero?"""
+    return not row["reason"].startswith("finite differences cannot be told from zero")
+
+
+def max_stderr(listed: list[Row]) -> float:
+    return max(row["settings"]["max_stderr"] for row in listed)
+
+
+def lists_words(rows: list[Row]) -> str:
+    """What the checks of lists came to: how many are known well, and by how much these are off; empty without rows."""
+    found = []
+    for name in dict.fromkeys(row["settings"]["list"] for row in rows):
+        listed = [row for row in rows if row["settings"]["list"] == name]
+        known = [row for row in listed if row["gain_stderr"] <= row["settings"]["max_stderr"] and has_signal(row)]
+        off = max((abs(row["gain"] - 1) for row in known), default=0)
+        failed = sum(row["verdict"] == "fail" for row in listed)
+        words = f"of {len(listed)} of `{name}` {len(known)} are known to {max_stderr(listed):g} and off by at most"
+        found.append(f"{words} {off:.3f}, {failed} fail")
+    return f"Lists of checks there, gains against differences: {'; '.join(found)}." if found else ""
+
+
 def on_cuda(rows: list[Row]) -> str:
     """How many gradient checks pass on a GPU, and what a backward pass costs there; empty without rows."""
     checks = [row for row in rows if row["bench"] == "checks"]

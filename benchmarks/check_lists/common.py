@@ -28,6 +28,7 @@ class Motion:
 class Listed:
     """A scene and a motion in it, and how well it must be known."""
 
+    of: str  # the list
     name: str
     scene: Callable[[], mi.Scene]
     motion: Motion

@@ -11,6 +11,8 @@ import numpy as np
 
 from benchmarks.check_lists.common import POINT, Listed, T, checkered, ground, lamp, moved, scene_of, turned, unit, view
 
+NAME = "patterns"
+
 
 def texels(**transform: Any) -> dict:
     data = np.random.default_rng(4).random((5, 4, 3)).astype(np.float32)
@@ -68,7 +70,8 @@ def patterns() -> Iterator[Listed]:
         for carrier in CARRIERS:
             for texture in TEXTURES:
                 for how, motion in motions.items():
-                    yield Listed(f"{texture} on a {carrier}{where}, {how}", partial(scene, texture, carrier), motion)
+                    name = f"{texture} on a {carrier}{where}, {how}"
+                    yield Listed(NAME, name, partial(scene, texture, carrier), motion)
     for name, scene in (("projector", projector), ("hard spot", hard_spot)):
         for how, motion in (("moved", moved("lamp.to_world")), ("turned", turned("lamp.to_world"))):
-            yield Listed(f"{name}, {how}", scene, motion)
+            yield Listed(NAME, f"{name}, {how}", scene, motion)

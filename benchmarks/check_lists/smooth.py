@@ -23,6 +23,8 @@ from benchmarks.check_lists.common import (
     view,
 )
 
+NAME = "smooth"
+
 EYE, TARGET = (0.9, 1.4, 5.2), (0.1, -0.2, 0)
 VERTEX_STEP = 0.01  # of differences, in edges of the mesh
 
@@ -98,7 +100,7 @@ def smooth() -> Iterator[Listed]:
             for how, motion in motions.items():
                 for depth in depths:
                     scene = partial(smooth_scene, mesh, material, depth)
-                    yield Listed(f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
+                    yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
 
 
 def one_vertex(mesh: str) -> Motion:

@@ -27,6 +27,8 @@ from benchmarks.check_lists.common import (
 )  # fmt: skip
 from benchmarks.check_lists.smooth import round_mesh
 
+NAME = "specular"
+
 MIRROR, GLASS = {"type": "conductor"}, {"type": "psdr_dielectric", "int_ior": 1.5}
 PLASTIC = {"type": "psdr_plastic", "int_ior": 1.5, "diffuse_reflectance": 0.5}
 LAMP = ((1.9, 3.2, 2.3), 0.5, 18)  # place, half of its side, radiance
@@ -135,22 +137,22 @@ def specular() -> Iterator[Listed]:
     yield from mirrored()
     yield from refracted()
     for light in LIGHTS:
-        yield Listed(f"plastic ball, {light}", partial(plastic_ball, light), moved(BODY))
-        yield Listed(f"plastic floor, {light}", partial(plastic_floor, light), moved(BODY))
-    yield Listed("window before the light", window, moved(BODY))
-    yield Listed("half-opaque mask", partial(mask, 0.5), moved("sheet.to_world"))
-    yield Listed("mask with holes", lambda: mask(holes()), moved("sheet.to_world"))
+        yield Listed(NAME, f"plastic ball, {light}", partial(plastic_ball, light), moved(BODY))
+        yield Listed(NAME, f"plastic floor, {light}", partial(plastic_floor, light), moved(BODY))
+    yield Listed(NAME, "window before the light", window, moved(BODY))
+    yield Listed(NAME, "half-opaque mask", partial(mask, 0.5), moved("sheet.to_world"))
+    yield Listed(NAME, "mask with holes", lambda: mask(holes()), moved("sheet.to_world"))
 
 
 def mirrored() -> Iterator[Listed]:
     turning = turned("mirror.to_world")
     for motion in (moved("card.to_world"), moved("mirror.to_world"), turning, moved("camera.to_world")):
-        yield Listed(f"card in a mirror, {_said(motion)}", in_mirror, motion)
+        yield Listed(NAME, f"card in a mirror, {_said(motion)}", in_mirror, motion)
     for motion in (moved("card.to_world"), turning):
-        yield Listed(f"two facing mirrors, {_said(motion)}", facing_mirrors, motion)
-    yield Listed("mirror floor", partial(plastic_floor, "area light", 4, **MIRROR), moved(BODY))
+        yield Listed(NAME, f"two facing mirrors, {_said(motion)}", facing_mirrors, motion)
+    yield Listed(NAME, "mirror floor", partial(plastic_floor, "area light", 4, **MIRROR), moved(BODY))
     for motion in (moved("mirror.to_world"), turning):
-        yield Listed(f"reflected light, {_said(motion)}", reflected, motion)
+        yield Listed(NAME, f"reflected light, {_said(motion)}", reflected, motion)
 
 
 def refracted() -> Iterator[Listed]:
@@ -160,8 +162,8 @@ def refracted() -> Iterator[Listed]:
         for what, glows in (("glowing", True), ("lit", False)):
             for motion in motions:
                 name = f"glass {kind}, {what} picture, {_said(motion)}"
-                yield Listed(name, partial(before_background, kind, glows), motion)
-    yield Listed("glass ball of facets, turned", partial(before_background, "facets", True), turned(BODY))
+                yield Listed(NAME, name, partial(before_background, kind, glows), motion)
+    yield Listed(NAME, "glass ball of facets, turned", partial(before_background, "facets", True), turned(BODY))
 
 
 def _said(motion: Motion) -> str:
