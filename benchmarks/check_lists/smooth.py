@@ -50,10 +50,10 @@ def torus() -> tuple[np.ndarray, np.ndarray]:
 def bumpy() -> tuple[np.ndarray, np.ndarray]:
     """A subdivided body with dents."""
     points, faces = meshes.ball(32, 64)
-    unit = (points - meshes.CENTRE) / meshes.RADIUS
-    φ = np.arctan2(unit[:, 2], unit[:, 0])
-    dents = 1 + 0.18 * np.sin(3 * φ) * (1 - unit[:, 1] ** 2) + 0.1 * np.cos(5 * unit[:, 1])
-    return leant(0.8 * dents[:, None] * unit), faces
+    ball = (points - meshes.CENTRE) / meshes.RADIUS
+    φ = np.arctan2(ball[:, 2], ball[:, 0])
+    dents = 1 + 0.18 * np.sin(3 * φ) * (1 - ball[:, 1] ** 2) + 0.1 * np.cos(5 * ball[:, 1])
+    return leant(0.8 * dents[:, None] * ball), faces
 
 
 def leant(points: np.ndarray) -> np.ndarray:

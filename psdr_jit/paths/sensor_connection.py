@@ -33,17 +33,17 @@ def seen_by_sensor(
     """
     cos = dr.maximum(dr.abs(dr.dot(si.n, view.ω)), LEAST_COSINE)
     height = start_height(si.p)
-    round_ = has_two_walls(si.shape)
+    two_walls = has_two_walls(si.shape)
     off = si.p - dr.mulsign(TOUCHES * height, dr.dot(si.n, view.ω)) * si.n - view.o
-    ray = mi.Ray3f(view.o, dr.select(round_, dr.normalize(off), view.ω))
-    ray.maxt = dr.select(round_, dr.norm(off), view.r - (TOUCHES * height + ROUNDING * view.r) / cos)
+    ray = mi.Ray3f(view.o, dr.select(two_walls, dr.normalize(off), view.ω))
+    ray.maxt = dr.select(two_walls, dr.norm(off), view.r - (TOUCHES * height + ROUNDING * view.r) / cos)
     if hide_emitters:
         active = active & (si.shape.emitter() == None)  # noqa: E711 (an array comparison)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     if hide_emitters:
         _, pi = see_through_emitters(scene, ray, pi)
     # What is met may be the surface itself: where a large face is, is rounded.
-    itself = (pi.shape == si.shape) & (pi.prim_index == si.prim_index) & ~round_
+    itself = (pi.shape == si.shape) & (pi.prim_index == si.prim_index) & ~two_walls
     itself &= pi.t >= view.r * (1 - SHADOW_EPSILON) - height / cos
     return active & (~pi.is_valid() | itself)
 
