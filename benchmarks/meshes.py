@@ -77,16 +77,8 @@ def flat_mesh(name: str, points: np.ndarray, faces: np.ndarray, bsdf: Any) -> An
 
 
 def smooth_mesh(name: str, points: np.ndarray, faces: np.ndarray, bsdf: Any) -> Any:
-    """A smooth-shaded Mitsuba mesh."""
+    """A smooth-shaded Mitsuba mesh. `bsdf`: or the emitter that it carries."""
     mesh = mi.Mesh(name, len(points), len(faces), has_vertex_normals=True, props=_props(bsdf, False))
-    return _filled(mesh, points, faces)
-
-
-def smooth_light(name: str, points: np.ndarray, faces: np.ndarray, emitter: Any) -> Any:
-    """A smooth-shaded Mitsuba mesh that emits."""
-    props = mi.Properties()
-    props["emitter"] = emitter
-    mesh = mi.Mesh(name, len(points), len(faces), has_vertex_normals=True, props=props)
     return _filled(mesh, points, faces)
 
 

@@ -69,7 +69,7 @@ def readme_charts(found: list[dict[str, Any]]) -> str:
         return EMPTY
     on_cuda = stored_rows(rows.RESULTS / CUDA)
     places = [sentences.machines(shown), sentences.on_cuda(on_cuda)]
-    places.append(sentences.lists_words([row for row in on_cuda if row["bench"] == "check_lists"]))
+    places.append(sentences.lists_words(grouped(on_cuda).get("check_lists", [])))
     return "\n\n".join(blocks) + "\n" + " ".join(filter(None, places))
 
 

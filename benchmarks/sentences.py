@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from benchmarks.tables import ERRORS, OURS, RIGHT, Row, geometric_mean, summary
+from psdr_jit.derivative.verdict import NO_SIGNAL
 
 PRIMAL = "path (primal)"
 PEER_OF_SWEEPS = "prb_projective, no guiding"
@@ -104,11 +105,7 @@ def machines(rows: list[dict[str, Any]]) -> str:
 
 def has_signal(row: Row) -> bool:
     """Could differences tell the derivative of a check from zero?"""
-    return not row["reason"].startswith("finite differences cannot be told from zero")
-
-
-def max_stderr(listed: list[Row]) -> float:
-    return max(row["settings"]["max_stderr"] for row in listed)
+    return not row["reason"].startswith(NO_SIGNAL)
 
 
 def lists_words(rows: list[Row]) -> str:
@@ -116,10 +113,11 @@ def lists_words(rows: list[Row]) -> str:
     found = []
     for name in dict.fromkeys(row["settings"]["list"] for row in rows):
         listed = [row for row in rows if row["settings"]["list"] == name]
-        known = [row for row in listed if row["gain_stderr"] <= row["settings"]["max_stderr"] and has_signal(row)]
+        bound = listed[0]["settings"]["max_stderr"]  # one for all of a list
+        known = [row for row in listed if row["gain_stderr"] <= bound and has_signal(row)]
         off = max((abs(row["gain"] - 1) for row in known), default=0)
         failed = sum(row["verdict"] == "fail" for row in listed)
-        words = f"of {len(listed)} of `{name}` {len(known)} are known to {max_stderr(listed):g} and off by at most"
+        words = f"of {len(listed)} of `{name}` {len(known)} are known to {bound:g} and off by at most"
         found.append(f"{words} {off:.3f}, {failed} fail")
     return f"Lists of checks there, gains against differences: {'; '.join(found)}." if found else ""
 

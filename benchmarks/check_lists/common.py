@@ -75,6 +75,7 @@ def lamp(origin: tuple, size: float, radiance: float) -> dict:
             "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
 
 
+LAMP = ((1.9, 3.2, 2.3), 0.5, 18)  # place, half of its side, radiance
 POINT = {"type": "point", "position": [1.9, 3.2, 2.3], "intensity": 20.0}
 
 

@@ -9,7 +9,20 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.check_lists.common import POINT, Listed, T, checkered, ground, lamp, moved, scene_of, turned, unit, view
+from benchmarks.check_lists.common import (
+    LAMP,
+    POINT,
+    Listed,
+    T,
+    checkered,
+    ground,
+    lamp,
+    moved,
+    scene_of,
+    turned,
+    unit,
+    view,
+)
 
 NAME = "patterns"
 
@@ -24,17 +37,18 @@ def texels_turned() -> dict:
 
 
 TEXTURES = {"checkerboard": checkered, "texels": texels, "turned texels": texels_turned}
+#: Plugin, and the axis and angle by which it is turned.
 CARRIERS = {
-    "plane": {"type": "rectangle", "to_world": ("rotate", [1, 0.2, 0.1], -70)},
-    "sphere": {"type": "sphere", "to_world": ("rotate", [0.3, 1, 0.2], 40)},
-    "cylinder": {"type": "cylinder", "to_world": ("rotate", [1, 0.4, 0.1], 60)},
+    "plane": ("rectangle", unit(1, 0.2, 0.1), -70),
+    "sphere": ("sphere", unit(0.3, 1, 0.2), 40),
+    "cylinder": ("cylinder", unit(1, 0.4, 0.1), 60),
 }
 
 
 def painted(texture: str, carrier: str) -> dict:
-    _, axis, angle = CARRIERS[carrier]["to_world"]
+    plugin, axis, angle = CARRIERS[carrier]
     bsdf = {"type": "twosided", "of": {"type": "diffuse", "reflectance": TEXTURES[texture]()}}
-    return {"type": CARRIERS[carrier]["type"], "to_world": T().rotate(unit(*axis), angle).scale(0.8), "bsdf": bsdf}
+    return {"type": plugin, "to_world": T().rotate(axis, angle).scale(0.8), "bsdf": bsdf}
 
 
 def pattern_scene(texture: str, carrier: str) -> mi.Scene:
@@ -46,22 +60,22 @@ def bounced_scene(texture: str, carrier: str) -> mi.Scene:
     wall = {"type": "rectangle", "to_world": T().translate([0.1, 0, -1.6]).scale(1.5),
             "bsdf": {"type": "roughconductor", "alpha": 0.15}}  # fmt: skip
     camera = view((0.4, 0.5, 1.9), (0.1, 0.3, -1.6), 46)
-    return scene_of(3, camera, thing=painted(texture, carrier), wall=wall, lamp=lamp((1.9, 3.2, 2.3), 0.5, 18))
+    return scene_of(3, camera, thing=painted(texture, carrier), wall=wall, lamp=lamp(*LAMP))
 
 
 def cast_scene(light: dict) -> mi.Scene:
     """A step that a light throws onto a floor."""
+    pose = T().look_at(origin=[0.4, 2.3, 0.7], target=[0.1, -0.6, -0.1], up=[0.2, 0, 1])
+    light = light | {"to_world": pose}
     return scene_of(2, view((0.7, 2.4, 3.6), (0.05, -0.5, 0), 40), lamp=light, floor=ground(-0.6))
 
 
 def projector() -> mi.Scene:
-    pose = T().look_at(origin=[0.4, 2.3, 0.7], target=[0.1, -0.6, -0.1], up=[0.2, 0, 1])
-    return cast_scene({"type": "projector", "to_world": pose, "fov": 27, "irradiance": texels(), "scale": 6.0})
+    return cast_scene({"type": "projector", "fov": 27, "irradiance": texels(), "scale": 6.0})
 
 
 def hard_spot() -> mi.Scene:
-    pose = T().look_at(origin=[0.4, 2.3, 0.7], target=[0.1, -0.6, -0.1], up=[0.2, 0, 1])
-    return cast_scene({"type": "spot", "to_world": pose, "cutoff_angle": 14, "beam_width": 14, "intensity": 20.0})
+    return cast_scene({"type": "spot", "cutoff_angle": 14, "beam_width": 14, "intensity": 20.0})
 
 
 def patterns() -> Iterator[Listed]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks import meshes
 from benchmarks.check_lists.common import (
+    LAMP,
     POINT,
     Listed,
     Motion,
@@ -70,7 +71,7 @@ MESHES = {
 }
 #: Material, and the path lengths at which it does something else.
 MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
-    "light": ({"type": "diffuse"}, (1, 2)),
+    "light": ({"type": "area", "radiance": 2.0}, (1, 2)),
     "diffuse": ({"type": "diffuse"}, (2, 3)),
     "rough metal": ({"type": "roughconductor", "alpha": 0.3}, (2, 3)),
     "rough glass": ({"type": "roughdielectric", "alpha": 0.3}, (3,)),
@@ -79,11 +80,8 @@ MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
 
 def smooth_scene(mesh: str, material: str, depth: int) -> mi.Scene:
     points, faces = MESHES[mesh]()
-    bsdf = mi.load_dict(MATERIALS[material][0])
-    shape = meshes.smooth_mesh("shape", points, faces, bsdf)
-    if material == "light":
-        shape = meshes.smooth_light("shape", points, faces, mi.load_dict({"type": "area", "radiance": 2.0}))
-    lights = {} if material == "light" else {"lamp": lamp((1.9, 3.2, 2.3), 0.5, 18), "point": POINT}
+    shape = meshes.smooth_mesh("shape", points, faces, mi.load_dict(MATERIALS[material][0]))
+    lights = {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
     return scene_of(depth, view(EYE, TARGET), shape=shape, floor=ground(-1.3), **lights)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks import meshes
 from benchmarks.check_lists.common import (
+    LAMP,
     MOVE,
     POINT,
     Listed,
@@ -31,7 +32,6 @@ NAME = "specular"
 
 MIRROR, GLASS = {"type": "conductor"}, {"type": "psdr_dielectric", "int_ior": 1.5}
 PLASTIC = {"type": "psdr_plastic", "int_ior": 1.5, "diffuse_reflectance": 0.5}
-LAMP = ((1.9, 3.2, 2.3), 0.5, 18)  # place, half of its side, radiance
 BODY = "body.vertex_positions"
 
 

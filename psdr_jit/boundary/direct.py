@@ -142,7 +142,7 @@ def trace(job: Job, edges: SecondaryEdges, line: ShadowLine) -> BoundarySegment 
     active &= found
     if job.facts.has_delta_emitters:
         face = edges.table.face_along(line.row, light.ω)
-        active &= ~ends_in_a_crease(job, met, on, light.n_perp, face, active)
+        active &= ~ends_in_a_crease(job, met, above, on, light.n_perp, face, active)
     r = dr.maximum(met.pi.t - on.lead - above, 0)
 
     infinite = mi.has_flag(light.emitter.flags(), mi.EmitterFlags.Infinite)

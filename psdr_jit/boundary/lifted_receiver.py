@@ -22,7 +22,7 @@ from ..core.records import Hit
 from ..core.sensor_frame import look_at
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.kind import OnEdge
-from ..edges.points import CLEAR_OF_LIFT, LEAST_SLANT
+from ..edges.points import CLEAR_OF_LIFT, LEAST_SLANT, cot_between
 from ..paths.surface_at import surface_at
 from ..plan.job import Job
 
@@ -76,25 +76,30 @@ def lifted_receiver(job: Job, landing: Landing, x: mi.Point3f, active: mi.Bool) 
 
 
 def ends_in_a_crease(
-    job: Job, landing: Landing, on: OnEdge, n_perp: mi.Vector3f, face: mi.Normal3f, active: mi.Bool
+    job: Job,
+    landing: Landing,
+    above: mi.Float,
+    on: OnEdge,
+    n_perp: mi.Vector3f,
+    face: mi.Normal3f,
+    active: mi.Bool,
 ) -> mi.Bool:
     """Is x_D so near to where the edge's own `face` (unit normal) cuts into the receiver that the curve between both
     counts what lies between them?
 
     A face in line with a point or directional light casts its shadow along that curve. What lies next to the curve is
     looked at from past the dark of an overhanging face, which is h cot φ wide if the surfaces meet at an angle φ
-    (`kind_junction.Junctions.side`), and a step that lies nearer is part of the step there. `n_perp`: to the open side.
+    (`kind_junction.Junctions.side`), and a step that lies nearer is part of the step there. `above`: as of
+    `lifted_receiver`; `n_perp`: to the open side.
     """
     ω, n = -landing.ray.d, landing.n
-    height = start_height(landing.p)
-    cos, sin = dr.dot(face, n), dr.maximum(dr.norm(dr.cross(face, n)), LEAST_SLANT)
-    dark = height * dr.abs(cos) / sin
-    overhangs = dr.dot(face, n_perp) * cos < 0
+    sin = dr.maximum(dr.norm(dr.cross(face, n)), LEAST_SLANT)
+    dark = start_height(landing.p) * cot_between(face, n)
+    overhangs = dr.dot(face, n_perp) * dr.dot(face, n) < 0
     seen_along = look_at(job.frame, landing.p, mi.Point2f(LENS_CENTRE)).ω
     slant = dr.abs(dr.dot(n, seen_along)) / dr.norm(dr.cross(seen_along, dr.cross(face, n) / sin))
     aside = on.offset / dr.clip(slant, LEAST_SLANT, 1)
     looked_past = aside + CLEAR_OF_LIFT * dark - dr.select(overhangs, dark, -dark)
-    above = height / dr.maximum(dr.dot(n, ω), LEAST_SLANT)
     to_face = dr.abs(dr.dot(face, ω)) * dr.dot(on.x - landing.p, ω) / sin  # along the receiver
     near = active & (dr.squared_norm(face) > 0) & (to_face < looked_past)
     towards = -dr.normalize(n_perp - dr.dot(n_perp, n) * n)

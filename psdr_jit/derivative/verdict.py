@@ -49,6 +49,9 @@ def judge(d: GroupedImages, f1: GroupedImages, f2: GroupedImages, block: int, *,
     return Verdict(decision, reason, slope.value, slope.stderr, test.rms_z, test.max_z, test.blocks)
 
 
+#: Where there is nothing to compare with.
+NO_SIGNAL = "finite differences cannot be told from zero"
+
 #: What helps where noise decides.
 MORE = "allow more seconds, or take fewer pixels or samples a seed"
 
@@ -76,7 +79,7 @@ def _decide(slope: Gain, test: BlockTest, images: tuple[GroupedImages, ...], blo
         if test.max_z > MAX_Z:
             return FAIL, ("finite differences vanish within their error, the estimate does not: "
                           f"max |z| {test.max_z:.1f}")
-        return INCONCLUSIVE, ("finite differences cannot be told from zero; if the gradient ought to vanish, "
+        return INCONCLUSIVE, (f"{NO_SIGNAL}; if the gradient ought to vanish, "
                               "give an absolute bound (zero_bound)")
     return _judge_gain(slope, test, seeds, rule.tolerance, rule.max_stderr)
 

@@ -16,7 +16,7 @@ from .kind import OnEdge, Side, Sight, Use
 from .kind_mesh import BetweenFaces, on_fixed, straight_point
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import LEAST_SLANT, ROUNDING_LEAD, clear_of_lift
+from .points import ROUNDING_LEAD, clear_of_lift, cot_between
 from .rows import EdgeRows
 from .wedges import Wedges, meeting_wedges
 
@@ -64,12 +64,7 @@ class Junctions(BetweenFaces):
         Mitsuba lifts rays off a surface along its normal, by h: where the surfaces meet at an angle φ (cos φ = n0·n1),
         closer to the curve than h cot φ they start behind what overhangs. Distances are along the surface.
         """
-        n0, n1 = self._normals(row, active)
-        cot = dr.abs(dr.dot(n0, n1)) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
-        return clear_of_lift(x) * cot
-
-    def _normals(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Normal3f, mi.Normal3f]:
-        return dr.gather(mi.Normal3f, self.rows.n0, row, active), dr.gather(mi.Normal3f, self.rows.n1, row, active)
+        return clear_of_lift(x) * cot_between(*self.normals(row, active))
 
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         side = dr.cross(dx, ω)
@@ -84,7 +79,7 @@ class Junctions(BetweenFaces):
         side; in front is the surface with the larger n·s/(n·ω), s the direction to the side. So much nearer, for a step
         of 1, the ray has to start: else it begins behind a surface that is seen at a grazing angle.
         """
-        n0, n1 = self._normals(row, active)
+        n0, n1 = self.normals(row, active)
         s = dr.select(which == 0, -1.0, 1.0) * sight.n_perp
         across = dr.norm(dr.cross(sight.ω, dr.normalize(dr.cross(n0, n1))))
         f0, f1 = dr.dot(n0, sight.ω), dr.dot(n1, sight.ω)

@@ -49,6 +49,10 @@ class BetweenFaces(FixedKind):
     def places(self) -> mi.Point3f:
         return (self.rows.p0 + self.rows.p1) / 2
 
+    def normals(self, row: mi.UInt32, active: mi.Bool) -> tuple[mi.Normal3f, mi.Normal3f]:
+        """Of both faces at the edges."""
+        return dr.gather(mi.Normal3f, self.rows.n0, row, active), dr.gather(mi.Normal3f, self.rows.n1, row, active)
+
 
 @dataclass(frozen=True)
 class MeshEdges(BetweenFaces):
@@ -80,7 +84,7 @@ class MeshEdges(BetweenFaces):
         return on_fixed(x, dx, self.centre, dr.gather(mi.Float, self.rows.blur, row, active), active)
 
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
-        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        n0, n1 = self.normals(row, active)
         border = dr.gather(mi.Bool, self.rows.border, row, active)
         side = dr.cross(dx, ω)
         across = dr.norm(side)
@@ -126,7 +130,7 @@ class MeshEdges(BetweenFaces):
 
         A line of sight to such an edge runs along the face, and whether it meets what ends with it is rounding.
         """
-        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        n0, n1 = self.normals(row, active)
         border = dr.gather(mi.Bool, self.rows.border, row, active)
         a0, a1 = face_sides(n0, n1, sight.ω)
         one = ~border & ((a0 == 0) ^ (a1 == 0))
@@ -142,7 +146,7 @@ class MeshEdges(BetweenFaces):
         return dr.select(rows.border & ~rows.traced, sight.at.x + sight.lead * into, self.aim(row, sight, active))
 
     def face_along(self, row: mi.UInt32, ω: mi.Vector3f, active: mi.Bool) -> mi.Normal3f:
-        n0, n1 = (dr.gather(mi.Normal3f, n, row, active) for n in (self.rows.n0, self.rows.n1))
+        n0, n1 = self.normals(row, active)
         return dr.select(dr.abs(dr.dot(n0, ω)) < dr.abs(dr.dot(n1, ω)), n0, n1)
 
     def _face(self, rows: EdgeRows, use1: mi.Bool, sight: Sight, active: mi.Bool) -> mi.PreliminaryIntersection3f:

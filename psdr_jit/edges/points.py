@@ -63,6 +63,11 @@ def clear_of_lift(x: mi.Point3f) -> mi.Float:
     return CLEAR_OF_LIFT * start_height(x)
 
 
+def cot_between(n0: mi.Normal3f, n1: mi.Normal3f) -> mi.Float:
+    """|cot φ| of the angle φ at which surfaces with these unit normals meet, bounded where they are nearly flush."""
+    return dr.abs(dr.dot(n0, n1)) / dr.maximum(dr.norm(dr.cross(n0, n1)), LEAST_SLANT)
+
+
 def past_lift(x: mi.Point3f, offset: mi.Float, lead: mi.Float, r: mi.Float) -> tuple[mi.Float, mi.Float]:
     """`offset` and `lead`, or more, with which what an outline at `x` hides is looked at from the distance r [m].
 
