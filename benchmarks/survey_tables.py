@@ -25,7 +25,8 @@ def sentence(rows: list[Row]) -> str:
     words = Counter(row["word"] for row in rows)
     refused = [row for row in rows if row["word"] == REFUSED]
     media = sum(MEDIUM in row["reason"] for row in refused)
-    silent, seconds = sum(words[word] for word in SILENT), [row["settings"]["seconds"] for row in rows]
+    checked = [row for row in rows if row["word"] in SILENT] or rows
+    silent, seconds = sum(words[word] for word in SILENT), [row["settings"]["seconds"] for row in checked]
     limits = " to ".join(f"{s:g}" for s in sorted({min(seconds), max(seconds)}))
     folders = " and ".join(sorted({scene_of(row).partition("/")[0] for row in rows}))
     other = {word: count for word, count in words.items() if word not in (*SILENT, WARNED, REFUSED)}

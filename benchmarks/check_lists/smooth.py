@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import mitsuba as mi
@@ -10,7 +10,9 @@ import numpy as np
 
 from benchmarks import meshes
 from benchmarks.check_lists.common import (
+    ABOUT,
     LAMP,
+    MOVE,
     POINT,
     Listed,
     Motion,
@@ -19,7 +21,6 @@ from benchmarks.check_lists.common import (
     lamp,
     moved,
     scene_of,
-    turned,
     unit,
     view,
 )
@@ -27,7 +28,9 @@ from benchmarks.check_lists.common import (
 NAME = "smooth"
 
 EYE, TARGET = (0.9, 1.4, 5.2), (0.1, -0.2, 0)
+BESIDE = (1.3, 0.4, -0.7)  # a point of the axis that bodies turn about
 VERTEX_STEP = 0.01  # of differences, in edges of the mesh
+SEEN_EDGES = 6.0  # width of the view of a vertex that moves
 
 
 def round_mesh(segments: int) -> tuple[np.ndarray, np.ndarray]:
@@ -78,31 +81,38 @@ MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
 }
 
 
-def smooth_scene(mesh: str, material: str, depth: int) -> mi.Scene:
+def smooth_scene(mesh: str, material: str, depth: int, camera: Callable[[], dict]) -> mi.Scene:
     points, faces = MESHES[mesh]()
     shape = meshes.smooth_mesh("shape", points, faces, mi.load_dict(MATERIALS[material][0]))
     lights = {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
-    return scene_of(depth, view(EYE, TARGET), shape=shape, floor=ground(-1.3), **lights)
+    return scene_of(depth, camera(), shape=shape, floor=ground(-1.3), **lights)
 
 
 def smooth() -> Iterator[Listed]:
     positions = "shape.vertex_positions"
+    whole = partial(view, EYE, TARGET)
     for mesh in MESHES:
         motions = {
-            "moved": moved(positions),
-            "turned": turned(positions),
+            "moved": (moved(positions), whole),
+            "turned": (swung(mesh), whole),
             "vertex": one_vertex(mesh),
-            "camera": moved("camera.to_world"),
+            "camera": (moved("camera.to_world"), whole),
         }
         for material, (_, depths) in MATERIALS.items():
-            for how, motion in motions.items():
+            for how, (motion, camera) in motions.items():
                 for depth in depths:
-                    scene = partial(smooth_scene, mesh, material, depth)
+                    scene = partial(smooth_scene, mesh, material, depth, camera)
                     yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
 
 
-def one_vertex(mesh: str) -> Motion:
-    """The vertex that is farthest to the upper right in the view, outwards: on the outline.
+def swung(mesh: str) -> Motion:
+    """Velocities of a turn about an axis beside the body: about one through its middle, a ball stays what it is."""
+    points, _ = MESHES[mesh]()
+    return Motion("shape.vertex_positions", MOVE, np.cross(ABOUT, points - BESIDE))
+
+
+def one_vertex(mesh: str) -> tuple[Motion, Callable[[], dict]]:
+    """The vertex that is farthest to the upper right in the view, outwards: on the outline. Seen from close by.
 
     The finer the mesh, the more a step turns the normals around it.
     """
@@ -114,4 +124,6 @@ def one_vertex(mesh: str) -> Motion:
     edge = np.linalg.norm(points[faces[:, 0]] - points[faces[:, 1]], axis=1).mean()
     direction = np.zeros_like(points)
     direction[k] = points[k] / np.linalg.norm(points[k])
-    return Motion("shape.vertex_positions", VERTEX_STEP * edge, direction)
+    fov = np.degrees(SEEN_EDGES * edge / np.linalg.norm(seen[k]))
+    camera = partial(view, EYE, tuple(points[k].tolist()), float(fov))
+    return Motion("shape.vertex_positions", VERTEX_STEP * edge, direction), camera
