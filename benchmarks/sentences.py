@@ -117,8 +117,8 @@ def lists_words(rows: list[Row]) -> str:
         known = [row for row in listed if row["gain_stderr"] <= bound and has_signal(row)]
         off = max((abs(row["gain"] - 1) for row in known), default=0)
         failed = sum(row["verdict"] == "fail" for row in listed)
-        words = f"of {len(listed)} of `{name}` {len(known)} are known to {bound:g} and off by at most"
-        found.append(f"{words} {off:.3f}, {failed} fail")
+        words = f"of {len(listed)} of `{name}` {len(known)} have a standard error of at most {bound:g}"
+        found.append(f"{words} and are off by at most {off:.3f}, {failed} fail")
     return f"Lists of checks there, gains against differences: {'; '.join(found)}." if found else ""
 
 

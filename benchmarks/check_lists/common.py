@@ -36,8 +36,8 @@ class Listed:
     stderr: float = 0.0068
 
 
-def moved(param: str, direction: Any = ALONG) -> Motion:
-    return Motion(param, MOVE, direction)
+def moved(param: str, direction: Any = ALONG, eps: float = MOVE) -> Motion:
+    return Motion(param, eps, direction)
 
 
 def turned(param: str, axis: Any = ABOUT) -> Motion:

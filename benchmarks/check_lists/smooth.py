@@ -12,7 +12,6 @@ from benchmarks import meshes
 from benchmarks.check_lists.common import (
     ABOUT,
     LAMP,
-    MOVE,
     POINT,
     Listed,
     Motion,
@@ -29,7 +28,8 @@ NAME = "smooth"
 
 EYE, TARGET = (0.9, 1.4, 5.2), (0.1, -0.2, 0)
 BESIDE = (1.3, 0.4, -0.7)  # a point of the axis that bodies turn about
-VERTEX_STEP = 0.01  # of differences, in edges of the mesh
+STEP = 0.004  # of differences: a thirtieth of a pixel, which a blurred outline hardly shows
+VERTEX_STEP = 0.02  # the same in edges of the mesh
 SEEN_EDGES = 6.0  # width of the view of a vertex that moves
 
 
@@ -93,10 +93,10 @@ def smooth() -> Iterator[Listed]:
     whole = partial(view, EYE, TARGET)
     for mesh in MESHES:
         motions = {
-            "moved": (moved(positions), whole),
+            "moved": (moved(positions, eps=STEP), whole),
             "turned": (swung(mesh), whole),
             "vertex": one_vertex(mesh),
-            "camera": (moved("camera.to_world"), whole),
+            "camera": (moved("camera.to_world", eps=STEP), whole),
         }
         for material, (_, depths) in MATERIALS.items():
             for how, (motion, camera) in motions.items():
@@ -108,7 +108,7 @@ def smooth() -> Iterator[Listed]:
 def swung(mesh: str) -> Motion:
     """Velocities of a turn about an axis beside the body: about one through its middle, a ball stays what it is."""
     points, _ = MESHES[mesh]()
-    return Motion("shape.vertex_positions", MOVE, np.cross(ABOUT, points - BESIDE))
+    return Motion("shape.vertex_positions", STEP, np.cross(ABOUT, points - BESIDE))
 
 
 def one_vertex(mesh: str) -> tuple[Motion, Callable[[], dict]]:

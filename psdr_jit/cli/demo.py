@@ -1,6 +1,7 @@
 """The Cornell box: its derivative beside finite differences, then a box put back where a picture shows it.
 
-Takes about a minute on two cores. Writes gradient.png, gradient.exr and recovery.png.
+Takes a minute or two on two cores, the first time some more: kernels are compiled. Writes gradient.png, gradient.exr
+and recovery.png.
 """
 
 from __future__ import annotations

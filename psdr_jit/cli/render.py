@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     if output.suffix.lower() == ".exr":
         images.write_exr(output, {"primal": image}, aovs=aovs)
     else:
-        images.write_panels(output, [("primal", Path(args.scene).name, images.colours(image, aovs))])
+        images.write_picture(output, images.colours(image, aovs))
     if not args.quiet:
         print(f"wrote {output}")
     return 0

@@ -118,6 +118,13 @@ def read_metadata(path: str | os.PathLike) -> dict[str, str]:
         return {key.removeprefix("psdr_"): str(v) for key, v in file.header().items() if key.startswith("psdr_")}
 
 
+def write_picture(path: str | os.PathLike, image: np.ndarray) -> Path:
+    """Write linear radiance (H, W, C) as PNG, pixel by pixel, in sRGB."""
+    from matplotlib.image import imsave
+
+    return _replaced(path, lambda temporary: imsave(temporary, srgb(image), format="png"))
+
+
 def write_derivative_png(path: str | os.PathLike, image: np.ndarray, title: str = "",
                          unit: str = "radiance per unit") -> Path:
     """Write one derivative image (H, W, C) in red (positive) and blue (negative) with a colour bar."""

@@ -70,7 +70,7 @@ def _decide(slope: Gain, test: BlockTest, images: tuple[GroupedImages, ...], blo
     """`(decision, reason)`; `images`: the estimate and two halves of finite differences."""
     seeds = min(group.total for group in images)
     if seeds < MIN_SEEDS:
-        return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds of the estimate or of differences: {MORE}"
+        return INCONCLUSIVE, f"fewer than {MIN_SEEDS} seeds of the estimate or of a half of the differences: {MORE}"
     if rule.zero_bound is not None:
         return _judge_zero(*images, block, rule.zero_bound)
     if slope.power == 0 and not images[0].mean().any():

@@ -28,5 +28,5 @@ def row(gain: float, stderr: float, reason: str = "", verdict: str = "pass") -> 
 def test_what_is_not_known_does_not_count():
     noisy, zero = row(0.7, 0.1), row(0.0, 0.001, "finite differences cannot be told from zero; ...")
     said = sentences.lists_words([row(1.003, 0.002), row(0.99, 0.004, verdict="fail"), noisy, zero])
-    assert "of 4 of `smooth` 2 are known to 0.004 and off by at most 0.010, 1 fail" in said
+    assert "of 4 of `smooth` 2 have a standard error of at most 0.004 and are off by at most 0.010, 1 fail" in said
     assert sentences.lists_words([]) == ""
