@@ -8,7 +8,7 @@ shape; the rest that this leaves does not depend on its size.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -31,8 +31,11 @@ from .topology import INVALID
 #: Sine of the angle between two faces from which one stands off the other.
 STANDS_OFF = 0.05
 
-#: Of an integrator: by the names of a light and of what touches it, the contact and whether they meet at an angle.
-ANGLES: Slot[dict[tuple[str | int, str | int], tuple[Contact, bool]]] = Slot(dict)
+#: Sine of the angle between two faces up to which they are flush.
+FLUSH = 1e-3
+
+#: Of an integrator: by a question and the names of two shapes that touch, the contact and the answer.
+ANSWERS: Slot[dict[tuple[str, str | int, str | int], tuple[Contact, bool]]] = Slot(dict)
 
 #: Of an integrator: by the name of a light that touches something, its arrays, and whether it is shaded smooth.
 BENT: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
@@ -47,11 +50,13 @@ class Touching:
 
     lamps: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # an area light, and what it touches at an angle
     movers: tuple[mi.Shape, mi.Shape] | None = None  # of which one moves against the other
+    glass: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # smooth glass, and what a face of it is flush with
 
 
 def touching(found: EdgeSet, memory: Memory) -> Touching:
     """Of the edges that were found."""
-    return Touching(tuple(_touching_lamps(found, memory)), next(_moved_against(found), None))
+    glass = tuple(_flush_glass(found, memory))
+    return Touching(tuple(_touching_lamps(found, memory)), next(_moved_against(found), None), glass)
 
 
 def warn_about_contacts(job: Job, contacts: Touching) -> None:
@@ -71,6 +76,14 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             "the material form, which this integrator was asked for, the light that goes from one to the other where "
             "they meet is wrong (10 % of the "
             "derivative) and noisy; use form='spatial', or 'auto', which knows of contacts",
+            UnsupportedWarning,
+            memory,
+        )
+    for glass, other in contacts.glass:
+        warn_once(
+            f"a face of '{shown_name(glass)}', which is smooth glass, lies in one of '{shown_name(other)}': which of "
+            "the two a ray meets is rounding, in Mitsuba's images as well, and the derivative of what is seen through "
+            "the glass there is noise; lift it by a hundredth of its size, or sink it in",
             UnsupportedWarning,
             memory,
         )
@@ -124,19 +137,45 @@ def _touching_lamps(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, 
 
 
 def _with_lamp_at_an_angle(c: Contact, memory: Memory) -> bool:
-    """Is one of the two a light, off which the other stands? A contact is one object until a mesh changes."""
-    if not (c.a.mesh.is_emitter() or c.b.mesh.is_emitter()):
-        return False
-    key = (key_of(c.a.mesh), key_of(c.b.mesh))
-    known = memory[ANGLES].get(key)
+    """Is one of the two a light, off which the other stands?"""
+    return (c.a.mesh.is_emitter() or c.b.mesh.is_emitter()) and _answer(_at_an_angle, c, memory)
+
+
+def _flush_glass(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs of smooth glass and what it stands on, say."""
+    for c in found.contacts:
+        pair = [shape for shape in (c.a.mesh, c.b.mesh) if _is_glass(shape)]
+        if pair and c.a is not c.b and _answer(_flush, c, memory):
+            yield pair[0], c.b.mesh if pair[0] is c.a.mesh else c.a.mesh
+
+
+def _is_glass(shape: mi.Shape) -> bool:
+    """Does it send light on in another direction on its far side?"""
+    return shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+
+
+def _answer(question: Callable[[Contact], bool], c: Contact, memory: Memory) -> bool:
+    """What is the case of a contact, which is one object until a mesh changes."""
+    key = (question.__name__, key_of(c.a.mesh), key_of(c.b.mesh))
+    known = memory[ANSWERS].get(key)
     if known is None or known[0] is not c:
-        known = (c, _at_an_angle(c))
-        memory[ANGLES][key] = known
+        known = (c, question(c))
+        memory[ANSWERS][key] = known
     return known[1]
 
 
 def _at_an_angle(contact: Contact) -> bool:
     """Does a face beside an edge that lies in a face of the other mesh stand off that face?"""
+    return any(bool(np.any(sine > STANDS_OFF)) for sine in _sines(contact))
+
+
+def _flush(contact: Contact) -> bool:
+    """Does it lie in it?"""
+    return any(bool(np.any(sine < FLUSH)) for sine in _sines(contact))
+
+
+def _sines(contact: Contact) -> Iterator[np.ndarray]:
+    """Of the angles between faces beside edges that lie in faces of the other mesh, and those faces."""
     a, b = triangles(contact.a), triangles(contact.b)
     for own, other, resting in ((a, b, contact.a_in_b), (b, a, contact.b_in_a)):
         n_other = _normals(other)[resting.face]
@@ -144,9 +183,7 @@ def _at_an_angle(contact: Contact) -> bool:
             beside = own.edge_faces[resting.edge, k]
             there = beside != INVALID
             n_own = _normals(own)[beside[there]]
-            if np.any(np.linalg.norm(np.cross(n_own, n_other[there]), axis=1) > STANDS_OFF):
-                return True
-    return False
+            yield np.linalg.norm(np.cross(n_own, n_other[there]), axis=1)
 
 
 def _normals(mesh: TriangleMesh) -> np.ndarray:

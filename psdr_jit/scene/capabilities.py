@@ -145,8 +145,8 @@ SUPPORT = (
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "yes",
         _MOVING + "beside SDF grids that instances show: error; seen in them, frames of projectors and "
-        "hard rims: warning; edges mirrored at the very rim of a ball: up to a third of their pixels is missing; masks "
-        "before nothing: the image is that of `prb`, `path` drops light there"),
+        "hard rims: warning; glass flush with a surface: warning; edges mirrored at the very rim of a ball: up to a "
+        "third of their pixels is missing; masks before nothing: the image is that of `prb`, `path` drops light there"),
     Row("reflectance and IOR of mirrors, smooth glass and plastic", "yes",
         "IOR: `psdr_dielectric`, `psdr_plastic` in place of `dielectric`, `plastic`, which keep it as a plain number; "
         "behind glass as in the row above; opacity of a mask, what is under it or a bump map: error"),
