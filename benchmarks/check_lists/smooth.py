@@ -91,11 +91,12 @@ def smooth_scene(mesh: str, material: str, depth: int, camera: Callable[[], dict
 def smooth() -> Iterator[Listed]:
     positions = "shape.vertex_positions"
     whole = partial(view, EYE, TARGET)
-    for mesh in MESHES:
+    for mesh, make in MESHES.items():
+        points, faces = make()
         motions = {
             "moved": (moved(positions, eps=STEP), whole),
-            "turned": (swung(mesh), whole),
-            "vertex": one_vertex(mesh),
+            "turned": (swung(points), whole),
+            "vertex": one_vertex(points, faces),
             "camera": (moved("camera.to_world", eps=STEP), whole),
         }
         for material, (_, depths) in MATERIALS.items():
@@ -105,18 +106,16 @@ def smooth() -> Iterator[Listed]:
                     yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
 
 
-def swung(mesh: str) -> Motion:
+def swung(points: np.ndarray) -> Motion:
     """Velocities of a turn about an axis beside the body: about one through its middle, a ball stays what it is."""
-    points, _ = MESHES[mesh]()
     return Motion("shape.vertex_positions", STEP, np.cross(ABOUT, points - BESIDE))
 
 
-def one_vertex(mesh: str) -> tuple[Motion, Callable[[], dict]]:
+def one_vertex(points: np.ndarray, faces: np.ndarray) -> tuple[Motion, Callable[[], dict]]:
     """The vertex that is farthest to the upper right in the view, outwards: on the outline. Seen from close by.
 
     The finer the mesh, the more a step turns the normals around it.
     """
-    points, faces = MESHES[mesh]()
     forward = np.subtract(TARGET, EYE) / np.linalg.norm(np.subtract(TARGET, EYE))
     across = np.cross(forward, [-0.6, 0.8, 0])  # to the right and up
     seen = points - EYE

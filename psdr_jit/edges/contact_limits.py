@@ -21,12 +21,10 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.names import shown_name
-from .contacts import Contact
-from .intersections import TriangleMesh
+from .contacts import Contact, normals_beside
 from .seams import is_smooth
 from .segments import EdgeSet
 from .solids import Ball, Solid, triangles
-from .topology import INVALID
 
 #: Sine of the angle between two faces from which one stands off the other.
 STANDS_OFF = 0.05
@@ -178,19 +176,8 @@ def _sines(contact: Contact) -> Iterator[np.ndarray]:
     """Of the angles between faces beside edges that lie in faces of the other mesh, and those faces."""
     a, b = triangles(contact.a), triangles(contact.b)
     for own, other, resting in ((a, b, contact.a_in_b), (b, a, contact.b_in_a)):
-        n_other = _normals(other)[resting.face]
-        for k in range(2):
-            beside = own.edge_faces[resting.edge, k]
-            there = beside != INVALID
-            n_own = _normals(own)[beside[there]]
-            yield np.linalg.norm(np.cross(n_own, n_other[there]), axis=1)
-
-
-def _normals(mesh: TriangleMesh) -> np.ndarray:
-    """(F, 3) unit normals."""
-    corners = mesh.positions[mesh.faces].astype(float)
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), np.finfo(float).tiny)
+        for exists, here, there in normals_beside(own, other, resting):
+            yield np.linalg.norm(np.cross(here, there), axis=1)[exists]
 
 
 def _moved_against(found: EdgeSet) -> Iterator[tuple[mi.Shape, mi.Shape]]:

@@ -6,6 +6,7 @@ more finely than the other) and the surfaces that it consists of. Found once for
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,17 @@ class Contact:
     shared: Shared  # of edges of a and b
     a_in_b: Resting  # edges of a in faces of b
     b_in_a: Resting
+
+
+def normals_beside(
+    own: cut.TriangleMesh, other: cut.TriangleMesh, resting: Resting
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """`(is there a face, its unit normal, that of the face in which the edge rests)`: for one face beside each edge,
+    then for the other one.
+    """
+    there = cut.unit_normals(other.corners(resting.face))
+    for face in own.edge_faces[resting.edge].T:
+        yield face != INVALID, cut.unit_normals(own.corners(np.where(face == INVALID, 0, face))), there
 
 
 #: By two meshes: their states, and the contact found for these (None: they do not touch).

@@ -14,11 +14,10 @@ import numpy as np
 
 from ..core.joining import starts
 from ..core.upload import uploaded
-from .contacts import FLAT, Contact
-from .intersections import TriangleMesh, unit_normals
+from .contacts import FLAT, Contact, normals_beside
+from .intersections import TriangleMesh
 from .rows import EdgeRows
 from .solids import Solid, triangles
-from .topology import INVALID
 from .touching import Resting
 
 
@@ -40,10 +39,8 @@ def trace_in_flush_faces(rows: EdgeRows, solids: Sequence[Solid], contacts: Sequ
 
 def _alike(own: TriangleMesh, other: TriangleMesh, resting: Resting) -> np.ndarray:
     """The edges of which a face looks the same way as the face in which they rest."""
-    there = unit_normals(other.corners(resting.face))
     same = np.zeros(len(resting.edge), bool)
-    for face in own.edge_faces[resting.edge].T:
-        here = unit_normals(own.corners(np.where(face == INVALID, 0, face)))
+    for exists, here, there in normals_beside(own, other, resting):
         turned = np.linalg.norm(np.cross(here, there), axis=1)
-        same |= (face != INVALID) & (turned < FLAT) & (np.sum(here * there, axis=1) > 0)
+        same |= exists & (turned < FLAT) & (np.sum(here * there, axis=1) > 0)
     return resting.edge[same]

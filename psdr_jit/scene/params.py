@@ -54,7 +54,8 @@ def find_param(scene: Any, name: str, params: Any = None) -> ParamInfo:
     if name not in params:
         name = stable_name(scene, name)
     if name not in params:
-        raise ParameterError(f"the scene has no parameter '{name}'{_suggestion(name, _differentiable(params))}")
+        known = [found.name for found in differentiable_params(scene, params) if found.differentiable]
+        raise ParameterError(f"the scene has no parameter '{name}'{_suggestion(name, known or list(params.keys()))}")
     info = _describe(params, name)
     if not info.differentiable:
         raise ParameterError(f"parameter '{name}' cannot be differentiated: {info.reason}. "
@@ -125,12 +126,6 @@ def parameter_value(params: Any, name: str) -> Any:
 
 def _is_no_place(name: str) -> bool:
     return not name.endswith(("positions", "to_world"))
-
-
-def _differentiable(params: Any) -> list[str]:
-    """Names of those that can be; of all, if none can."""
-    names = list(params.keys())
-    return [name for name in names if _describe(params, name).differentiable] or names
 
 
 def _suggestion(name: str, known: list[str]) -> str:
