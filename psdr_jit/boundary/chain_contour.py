@@ -85,7 +85,7 @@ def contour(world: ChainWorld, hit: Hit, si: mi.SurfaceInteraction3f, line: mi.R
         a, at_face = world.surfaces.grids.face(number, si.p)
         at_face &= there
         round_, ends = dr.select(at_face, dr.cross(n, a), round_), ends | at_face
-        looked_at = world.surfaces.grids.inside(number, hit, si.p, line.d)
+        looked_at = world.surfaces.grids.inside(number, si.p, line.d)
     across = dr.dot(n, line.d)
     near = there & (ends | (dr.abs(across) < GRAZING))
     n = dr.select(ends, dr.cross(round_, line.d), n - round_ * (across / dr.dot(round_, line.d)))

@@ -7,17 +7,16 @@ n × a.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.records import Hit
 from ..core.upload import uploaded
 from ..edges.copy_table import shape_numbers
 from ..edges.grid_set import GridSet
-from ..edges.kind_grid import AWAY, OFF
+from ..edges.kind_grid import OFF
 from ..edges.scene_grids import scene_grids
 from ..plan.job import Job
 from ..scene.grids import blends_normals
@@ -91,23 +90,20 @@ class ChainGrids:
         e = self.grids.bend(grid, x, d - dr.dot(n, d) * n, met)
         return e - dr.dot(n, e) * n, met
 
-    def inside(self, shape: mi.UInt32, hit: Hit, x: mi.Point3f, d: mi.Vector3f) -> mi.Vector3f:
+    def inside(self, shape: mi.UInt32, x: mi.Point3f, d: mi.Vector3f) -> mi.Vector3f:
         """From a point x next to an outline to where the surface is looked at: towards the viewer, along the surface.
 
-        There, rays meet it with any normal. Blended normals turn from the viewer within about a cell of the outline: as
-        for edges that are seen directly, the first point is taken at which they do not (`edges.kind_grid`).
+        There, rays meet it with any normal.
         """
         grid, met = self._grid(shape)
         size = dr.rcp(dr.norm(self.grids.local(grid, x, met)[1][0]))
-        blended = met & (dr.gather(mi.UInt32, self.stepped, grid, met) == 0)
-        chosen, found = mi.Vector3f(0), mi.Bool(False)
-        for away in (OFF, *AWAY):
-            y = self.grids.onto(grid, mi.Point3f(x - away * size * d), met)
-            si = replace(hit, o=mi.Point3f(y - hit.t * d), d=d).interaction(blended)
-            shown = ~blended | (dr.dot(si.sh_frame.n, d) * dr.dot(si.n, d) > 0)
-            chosen = dr.select(shown & ~found, y - x, chosen)
-            found |= shown
-        return dr.select(met, chosen, 0)
+        y = self.grids.onto(grid, mi.Point3f(x - OFF * size * d), met)
+        return dr.select(met, mi.Vector3f(y - x), 0)
+
+    def blends(self, shape: mi.UInt32) -> mi.Bool:
+        """Is it a grid that is shaded with blended normals? They turn away where the surface itself does not."""
+        grid, met = self._grid(shape)
+        return met & (dr.gather(mi.UInt32, self.stepped, grid, met) == 0)
 
     def _grid(self, shape: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
         number = dr.gather(mi.UInt32, self.number, shape)

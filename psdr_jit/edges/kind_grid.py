@@ -2,8 +2,8 @@
 borders where the surface leaves the grid.
 
 A crease is an outline where one of its two cells turns to the viewer and the other away. Where both are seen, radiance
-steps there only if Mitsuba shades with the normals of the cells (`stepped`). The surface is seen from both sides:
-which of them an outline leads off tells the curvature along the line of sight.
+steps there if Mitsuba shades with the normals of the cells, or these differ much (`stepped`). The surface is seen from
+both sides: which of them an outline leads off tells the curvature along the line of sight.
 """
 
 from __future__ import annotations
@@ -37,9 +37,6 @@ OFF_STEP = 2e-4
 #: ... but clear of how exactly a point is known, relative to its coordinates.
 OFF_ROUNDING = 16 * UNIT_ROUNDOFF
 
-#: How far off an outline blended normals may still turn away, in units of a cell: what is tried in turn.
-AWAY = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5)
-
 #: Share of the weight of a crease that is seen from one side at the points where it is looked at.
 UNLIKELY = 0.02
 
@@ -68,8 +65,7 @@ class GridEdges(ContourKind):
     """Pieces of the edges of grids."""
 
     grids: GridSet
-    stepped: mi.UInt32  # by grid: 1 if creases are steps of radiance, and it is not shaded with blended normals
-    blended: bool  # is any of them?
+    stepped: mi.UInt32  # by grid: 1 if creases are steps of radiance
     centre: mi.Point3f  # of the scene
 
     @property
@@ -181,8 +177,6 @@ class GridEdges(ContourKind):
         _, turns, _ = self._crease(at)
         is_step = (at.rows.part == CREASE) & ~turns
         x = self._beside(at, sight, which, turns)
-        if self.blended:
-            x = dr.select(is_step | (at.rows.part == BORDER), x, self._shown(at, sight, x, active))
         known = (which == 0) | is_step
         pi = self._on_surface(at, sight.r, known & active)
         beside = sight.beside(which)
@@ -207,26 +201,6 @@ class GridEdges(ContourKind):
         value = dr.select(is_outline | above, at.cell.value(cell_p), at.below.value(cell_p))
         cell_p = cell_p - value / dr.squared_norm(gradient) * gradient
         return at.frame.to_world(dr.select(is_outline | above, cell_p, cell_p - mi.Vector3f(0, 0, 1)))
-
-    def _shown(self, at: _At, sight: Sight, x: mi.Point3f, active: mi.Bool) -> mi.Point3f:
-        """The first point from `x` along the surface towards the viewer that is not shaded as if it turned away.
-
-        Blended normals turn away within about a cell of the outline: the surface is black in between. The step into the
-        black is no edge here; it moves as the outline does, and is taken for it.
-        """
-        found = dr.zeros(mi.Bool, dr.width(x))
-        size, shown = _size(at.frame), mi.Point3f(x)
-        for away in (0.0, *AWAY):
-            y = mi.Point3f(x - away * size * sight.ω)
-            if away > 0:
-                y = self.grids.onto(at.rows.grid, y, active)
-            pi = self._on_surface(at, sight.r, active)
-            ray = mi.Ray3f(y - sight.r * sight.ω, sight.ω)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            fits = dr.dot(si.sh_frame.n, sight.ω) * dr.dot(si.n, sight.ω) > 0
-            shown = dr.select(fits & ~found, y, shown)
-            found |= fits
-        return shown
 
     def _on_surface(self, at: _At, t: mi.Float, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """The surface, met at the distance `t`."""

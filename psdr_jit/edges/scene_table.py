@@ -21,19 +21,21 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
-from ..scene.grids import VALUES, blends_normals
+from ..scene.grids import ALIKE, bent_degrees
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .capped import joined_rims
-from .coarse import COARSE, COARSE_UNDER_SKY, warn_about_coarse
+from .coarse import BENT, COARSE, COARSE_UNDER_SKY, warn_about_coarse
 from .contact_limits import touching, warn_about_contacts
 from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
-from .edge_shapes import GridPlace, edge_shapes
+from .edge_shapes import edge_shapes
+from .grid_set import GridSet
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
 from .kind_grid import GridEdges
+from .kind_grid_shading import GridShadingOutlines
 from .kind_junction import Junctions
 from .kind_mesh import MeshEdges
 from .kind_mirror_horizon import MirrorHorizons, lets_through, reflects
@@ -58,9 +60,8 @@ TABLE: Slot[EdgeTable | None] = Slot(lambda: None)
 #: painted, and these edges.
 STRAIGHT: Slot[tuple[list, tuple[list[bool], list[bool]], EdgeSet] | None] = Slot(lambda: None)
 
-#: Values along an axis of a grid from which the band along outlines, in which blended normals turn away, is narrow.
-FINE = 48
-
+#: Angle between blended normals of a grid and its surface [degrees] from which what has no edge is worth a warning.
+COARSE_GRID = 10.0
 
 #: Bodies whose curves with meshes are looked for.
 ROUND = {"sphere": Ball, "cylinder": Drum}
@@ -101,31 +102,10 @@ def edge_table(job: Job) -> EdgeTable:
         warn_about_touching(job.surfaces.ellipsoids, job.call.memory)
     grids = scene_grids(job)
     if grids is not None:
-        stepped = [not blends_normals(place.shape, job.call.memory) for place in grids.places]
-        _warn_about_blended(job, [place for place, steps in zip(grids.places, stepped, strict=True) if not steps])
-        kinds.append(GridEdges(grids, uploaded(mi.UInt32, np.array(stepped)), not all(stepped), centre))
+        kinds += _grid_edges(job, grids, centre)
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
     return EdgeTable(tuple(kinds), hidden, touching(straight, job.call.memory))
-
-
-def _warn_about_blended(job: Job, places: list[GridPlace]) -> None:
-    """Blended normals turn black within a cell of the outline; that step is counted at the outline."""
-    for place in places:
-        values = mi.traverse(place.shape)[VALUES].shape[0]
-        messages = []
-        if VALUES in place.facts.geometry:
-            messages.append(f"shape '{place.facts.name}' (sdfgrid, normals='smooth') is differentiated by its values: "
-                            "what turns black a fraction of a cell beside its outlines moves otherwise than these, and "
-                            "the derivative is 5 % off with 10 values along an axis; use normals='analytic', or more "
-                            "values")  # fmt: skip
-        if values < FINE:
-            messages.append(f"SDF grid '{place.shape.id()}' of {values} values a side is shaded with blended normals, "
-                            "which turn away in a band about a cell wide along its outlines: the derivative takes the "
-                            "band's inner border for the outline, and is up to a third off there; set normals to "
-                            "'analytic', or use a finer grid")  # fmt: skip
-        for message in messages:
-            warn_once(message, UnsupportedWarning, job.call.memory)
 
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball | Drum, ...]) -> EdgeSet:
@@ -256,6 +236,27 @@ def _mirror_horizons(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> 
 def _lets_light_in(job: Job, mesh: mi.Mesh) -> bool:
     """Do paths go on inside? What is scattered below a face's plane gets in, and back out after another vertex."""
     return job.options.depth_limit > 3 and mi.has_flag(mesh.bsdf().flags(), mi.BSDFFlags.BackSide)
+
+
+def _grid_edges(job: Job, grids: GridSet, centre: mi.Point3f) -> list[EdgeKind]:
+    """Of grids of signed distances: edges, and where blended normals turn away.
+
+    What a surface hides from its own points changes from cell to cell, however it is shaded. Where normals are bent
+    far enough, creases count as steps for that. No horizon stands for it (`horizons`).
+    """
+    bent = [bent_degrees(place.shape, job.call.memory) for place in grids.places]
+    for place, degrees in zip(grids.places, bent, strict=True):
+        if degrees > COARSE_GRID:
+            warn_once(
+                f"SDF grid '{place.shape.id()}' is shaded with blended normals that are up to {degrees:.0f} degrees "
+                "off its surface: where it turns from a light, a step of what it reflects is missing from the "
+                "derivative, some 2 % of it at 15 degrees; set normals to 'analytic', or use a finer grid",
+                UnsupportedWarning, job.call.memory,
+            )  # fmt: skip
+    steps = [not ALIKE < degrees <= BENT for degrees in bent]
+    outlines = GridShadingOutlines.of(grids, job.call.memory, centre)
+    edges = GridEdges(grids, uploaded(mi.UInt32, np.array(steps)), centre)
+    return [edges] if outlines is None else [edges, outlines]
 
 
 def _analytic(job: Job, analytic: list[ShapeFacts], centre: mi.Point3f) -> AnalyticCurves | None:

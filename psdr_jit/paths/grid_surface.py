@@ -2,16 +2,18 @@
 
 A ray of moving origin and direction meets the surface f = 0 where it meets the tangent plane, which moves by −δf / |∇f|
 along the normal with the values, and with the place of the grid. The normal is that of the cell there. For shading it
-may be blended, as Mitsuba does [Hansson-Söderlund et al. 2022]: between the normals of the eight cells about the
-nearest grid point, the slopes of each taken across it at the coordinates of the point.
+may be blended (`core.sdf_octant`).
 """
 
 from __future__ import annotations
+
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.sdf_cell import Cell
+from ..core.sdf_octant import Octant
 from ..scene.grids import TO_WORLD, VALUES, MovingGrid
 from .own_surface import of_hit, on_ray, where_active
 
@@ -66,28 +68,14 @@ class _Field:
         within = mi.Vector3f(*(a - mi.Float(c) for a, c in zip((q.x, q.y, q.z), corner, strict=True)))
         return Cell(*layers), within
 
-    def _value(self, q: mi.Point3f) -> mi.Float:
-        cell, within = self.cell(q)
-        return cell.value(within)
-
     def blended(self, q: mi.Point3f) -> mi.Vector3f:
-        """Mitsuba's smooth normal, of any length. The grid ends before the cell below the first: it does not count."""
+        """Mitsuba's smooth normal, of any length."""
         middle = [dr.round(dr.detach(a)) for a in (q.x, q.y, q.z)]
-        slopes, shares = [], []
-        for axis in range(3):
-            planes = []
-            for step in (-1, 0, 1):
-                at = mi.Point3f(q)
-                at[axis] = dr.clip(middle[axis] + step, 0, mi.Float(self.cells))
-                planes.append(self._value(at))
-            slopes.append([planes[1] - planes[0], planes[2] - planes[1]])
-            share = q[axis] - middle[axis] + 0.5
-            above = dr.select(middle[axis] < 1, 1, share)
-            shares.append([1 - above, above])
-        n = mi.Vector3f(0)
-        for k in range(8):
-            i = [k & 1, k >> 1 & 1, k >> 2 & 1]
-            weight = shares[0][i[0]] * shares[1][i[1]] * shares[2][i[2]]
-            slope = mi.Vector3f(*(slopes[axis][i[axis]] for axis in range(3)))
-            n += dr.select(dr.detach(weight) != 0, weight * dr.normalize(slope), 0)
-        return n
+        sign = [dr.select(dr.detach(q[k]) >= middle[k], mi.Float(1), -1) for k in range(3)]
+        last, size, values = mi.Float(self.cells), self.cells + 1, {}
+        for step in product((-1, 0, 1), repeat=3):
+            at = [mi.UInt32(dr.clip(middle[k] + sign[k] * step[k], 0, last)) for k in range(3)]
+            values[step] = dr.gather(mi.Float, self.values, at[0] + size * (at[1] + size * at[2]), self.active)
+        octant = Octant(values, [(sign[k] > 0) & (middle[k] < 1) for k in range(3)])
+        n = octant.blended(mi.Vector3f(*((q[k] - middle[k]) * sign[k] for k in range(3))))
+        return mi.Vector3f(*(n[k] * sign[k] for k in range(3)))

@@ -127,7 +127,7 @@ SUPPORT = (
     Row("rectangle, disk, sphere, cylinder, B-spline and linear curve, SDF grid, ellipsoids", "yes",
         "stretched or sheared spheres and cylinders, mirrored ones that move, disks and instances turned about an axis "
         "that is not of length 1, SDF grids that are turned or have unequal numbers of values along the axes: error; "
-        "smooth normals on fewer than 48 values a side: warning"),
+        "smooth normals more than 10 degrees off the surface: warning"),
     Row("ellipsoidsmesh; instanced curves and ellipsoids", "error", _MOVING + "materials and radiance are fine"),
     Row("instances", "yes",
         "that rest; one that moves: error, load the mesh once per copy; tens of them: Mitsuba is slow with more"),

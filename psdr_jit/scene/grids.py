@@ -24,11 +24,14 @@ VALUES, TO_WORLD = "grid", "to_world"
 #: Points of a grid that are looked at.
 SAMPLES = 256
 
-#: Length of the vector between shading normal and surface normal up to which they are the same: rounding is less.
-ALIKE = 1e-3
+#: Angle between shading normal and surface normal up to which they are the same [degrees]: rounding is less.
+ALIKE = 0.05
 
-#: Of an integrator: grids that have been looked at, kept alive, by their id; and whether they blend normals.
-LOOKED_AT: Slot[dict[int, tuple[mi.Shape, bool]]] = Slot(dict)
+#: Share of these points at which the angle is less than the one that a grid is judged by.
+SHARE = 0.9
+
+#: Of an integrator: grids that have been looked at, kept alive, by their id; and how far their normals are bent.
+LOOKED_AT: Slot[dict[int, tuple[mi.Shape, float]]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -61,15 +64,20 @@ def moving_grids(scene: mi.Scene, facts: SceneFacts, memory: Memory) -> list[Mov
 
 def blends_normals(shape: mi.Shape, memory: Memory) -> bool:
     """Is a grid shaded with normals blended between its cells? It does not tell; looked up once."""
+    return bent_degrees(shape, memory) > ALIKE
+
+
+def bent_degrees(shape: mi.Shape, memory: Memory) -> float:
+    """Angle [degrees] between the shading normals of a grid and its surface, where its cells meet; looked up once."""
     known = memory[LOOKED_AT]
     if id(shape) not in known:
         with dr.suspend_grad():
-            known[id(shape)] = (shape, _blends(shape))
+            known[id(shape)] = (shape, _bent_degrees(shape))
     return known[id(shape)][1]
 
 
-def _blends(shape: mi.Shape) -> bool:
-    """At points between cells, do the normals differ?"""
+def _bent_degrees(shape: mi.Shape) -> float:
+    """The angle at points between cells; 0 where there are none."""
     params = mi.traverse(shape)
     f = np.array(dr.detach(params[VALUES]))[..., 0].transpose(2, 1, 0)
     points = []
@@ -83,10 +91,12 @@ def _blends(shape: mi.Shape) -> bool:
     points = np.concatenate(points) / (f.shape[0] - 1)
     points = points[:: max(1, len(points) // SAMPLES)]
     if len(points) == 0:
-        return False
+        return 0.0
     x = params[TO_WORLD] @ mi.Point3f(*(uploaded(mi.Float, points[:, k]) for k in range(3)))
     pi = dr.zeros(mi.PreliminaryIntersection3f, len(points))
     pi.valid, pi.t, pi.shape = mi.Bool(True), mi.Float(1), mi.ShapePtr(shape)
     towards = mi.Vector3f(0, 0, 1)
     si = pi.compute_surface_interaction(mi.Ray3f(x - towards, towards), mi.RayFlags.All)
-    return bool(dr.any(dr.norm(si.sh_frame.n - si.n) > ALIKE))
+    angle = 2 * np.degrees(np.arcsin(np.array(dr.norm(si.sh_frame.n - si.n)) / 2))
+    angle = angle[np.isfinite(angle)]  # at the border of the grid there may be no normal
+    return float(np.quantile(angle, SHARE)) if len(angle) else 0.0
