@@ -93,6 +93,8 @@ def describe(result: Any, out: Path, seconds: float) -> str:
     """What became of the run, in a few lines."""
     loss = f"loss {result.loss:.3e} (mean of the last ones)"
     lines = [f"{result.status} after {result.iterations} iterations, {seconds:.1f} s; {loss}"]
+    if not result.losses:
+        lines.append("  there was nothing left to do; raise --iterations to go on")
     for name, now in result.offsets.items():
         for kind, value in now.items():
             lines.append(f"  {name}: {kind} from the scene file {result.start_offsets[name][kind]:.4g} -> {value:.4g}")

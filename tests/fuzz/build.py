@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import mitsuba as mi
@@ -27,7 +29,7 @@ def _resolved(item: dict[str, Any]) -> Any:
         if made["type"] == "envmap":
             return {**made, "bitmap": mi.Bitmap(np.repeat(grey[..., None], 3, axis=2))}
         return {**made, **RAW, "bitmap": mi.Bitmap(grey[..., None])}
-    return _mesh(made) if made["type"] == "mesh" else made
+    return MADE[made["type"]](made) if made["type"] in MADE else made
 
 
 def pose_of(steps: list) -> mi.ScalarTransform4f:
@@ -66,3 +68,32 @@ def _mesh(item: dict[str, Any]) -> mi.Mesh:
     params["faces"] = faces.ravel().astype(np.uint32)
     params.update()
     return mesh
+
+
+def _grid(item: dict[str, Any]) -> dict[str, Any]:
+    """A bumpy ball, or a ring, in the unit cube."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, item.pop("values"))] * 3, indexing="ij")
+    height, often, phase = item.pop("bumps")
+    ring = item.pop("body") == "ring"
+    f = np.hypot(np.hypot(x, y) - 0.55, z) - 0.28 if ring else np.sqrt(x * x + y * y + z * z) - 0.7
+    f += (0.5 if ring else 1.0) * height * np.sin(often * x + phase) * np.cos(often * y) * np.cos(0.7 * often * z)
+    return {**item, "grid": mi.TensorXf(f[..., None].astype(np.float32))}
+
+
+def _curve(item: dict[str, Any]) -> mi.Shape:
+    """From a file, as Mitsuba reads the points of curves."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "points.txt"
+        path.write_text("".join(" ".join(map(str, p)) + "\n" for p in item.pop("points")))
+        return mi.load_dict({**item, "filename": str(path)})
+
+
+def _ellipsoids(item: dict[str, Any]) -> dict[str, Any]:
+    bodies = np.array(item.pop("bodies"), dtype=np.float32)
+    turns = bodies[:, 6:] / np.linalg.norm(bodies[:, 6:], axis=1, keepdims=True)
+    given = {"centers": bodies[:, :3], "scales": bodies[:, 3:6], "quaternions": turns}
+    return {**item, **{name: mi.TensorXf(np.ascontiguousarray(value)) for name, value in given.items()}}
+
+
+#: What is made of shapes that are not given as Mitsuba takes them.
+MADE = {"mesh": _mesh, "sdfgrid": _grid, "bsplinecurve": _curve, "linearcurve": _curve, "ellipsoids": _ellipsoids}

@@ -1,6 +1,7 @@
-"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [specular|bidirectional]`.
+"""Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [KIND]`.
 
-`specular`: with mirrors, glass, plastic, windows and masks; `bidirectional`: these by `psdr_bdpt`.
+KIND is `specular` (with mirrors, glass, plastic, windows and masks), `bidirectional` (these by `psdr_bdpt`), `curved`
+(with SDF grids, curves, ellipsoids and instances), or nothing.
 """
 
 from __future__ import annotations
@@ -8,13 +9,15 @@ from __future__ import annotations
 import sys
 
 import mitsuba as mi
+from fuzz.curved import curved_case_of
 from fuzz.scenes import case_of
 from fuzz.specular import bidirectional_case_of, specular_case_of
 from fuzz.verdict import VARIANT, examine
 
 import psdr_jit  # noqa: F401  (registers the plugins)
 
-KINDS = {"": case_of, "specular": specular_case_of, "bidirectional": bidirectional_case_of}
+KINDS = {"": case_of, "specular": specular_case_of, "bidirectional": bidirectional_case_of,
+         "curved": curved_case_of}  # fmt: skip
 
 
 def main(first: int, count: int, kind: str = "") -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,6 +93,15 @@ def test_an_earlier_run_is_not_overwritten(llvm, whole):
     config, out = whole
     done = subprocess.run(command(config, out), capture_output=True, text=True)
     assert done.returncode == 2 and "--resume" in done.stderr
+
+
+def test_a_finished_run_says_that_nothing_is_left(llvm, whole, tmp_path):
+    config, out = whole
+    shutil.copytree(out, tmp_path / "out")
+    told = [word for word in command(config, tmp_path / "out", "--resume") if word != "--quiet"]
+    done = subprocess.run(told, capture_output=True, text=True)
+    assert done.returncode == 0 and "nothing left to do" in done.stdout
+    same_as_whole(whole, tmp_path / "out")
 
 
 def test_what_a_run_leaves(llvm, whole):
