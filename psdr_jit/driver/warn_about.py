@@ -17,8 +17,9 @@ def warn_about(call: Call, facts: SceneFacts) -> None:
     warn_about_painted_lights(call.scene, facts, call.memory)
     if call.options.hide_emitters:
         warn_about_shapes_behind_lights(call.scene, call.sensor, facts, call.memory)
-    if facts.geometry_moves and is_time(call.sensor, call.memory):
-        warn_about_clipping(call.scene, call.sensor, facts, call.memory)
+    if is_time(call.sensor, call.memory):
+        if facts.geometry_moves:
+            warn_about_clipping(call.scene, call.sensor, facts, call.memory)
         warn_about_bent_normals(call.scene, call.sensor, facts, call.memory)
     if call.mode == "backward":
         warn_about_stale_values(call.scene, facts, call.memory)

@@ -36,8 +36,9 @@ from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
 #: Exterior angle below which two flat-shaded faces count as one [rad].
 COPLANAR_ANGLE = 1e-4
 
-#: Share of faces without area among a mesh's edges, by length, up to which what they do is not seen.
-FEW_SLIVERS = 0.01
+#: Share of faces without area among a mesh's edges, by length, up to which what they do is not seen: they take 3 % of
+#: the outlines along them at most.
+FEW_SLIVERS = 0.1
 
 
 @dataclass

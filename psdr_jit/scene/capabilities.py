@@ -154,13 +154,13 @@ SUPPORT = (
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
-        "a bump map's slopes step at edges; where bent normals turn from the viewer is none: up to 8 % with steep maps "
-        "all over a ball, more where the sensor sees steep ones aslant: warning"),
+        "a bump map's slopes step at edges; where bent normals turn from the viewer is none: if the shape, the camera "
+        "or the map moves and half a per cent of what is seen of it is turned, as at the rim of a ball, warning"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),
     Row("NaN vertices, empty meshes, meshes without area, scenes without shapes", "error", ""),
-    Row("non-manifold edges, duplicate and collapsed faces", "yes", "faces with three corners in a row: warning"),
+    Row("non-manifold edges, duplicate and collapsed faces", "yes", "many faces with three corners in a row: warning"),
     Row("meshes that cut into each other, a sphere or cylinder in a mesh", "yes",
         "the curve where they meet, also of parts of one mesh; smooth-shaded lights that touch others, lights in "
         "windows or masks: warning"),

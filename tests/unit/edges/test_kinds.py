@@ -20,6 +20,7 @@ from psdr_jit.edges.kind_analytic import AnalyticCurves
 from psdr_jit.edges.kind_curve_pattern import RodPatterns, TubePatterns
 from psdr_jit.edges.kind_ellipsoid import EllipsoidOutlines
 from psdr_jit.edges.kind_grid import GridEdges
+from psdr_jit.edges.kind_grid_shading import GridShadingOutlines
 from psdr_jit.edges.kind_junction import Junctions
 from psdr_jit.edges.kind_mesh import MeshEdges
 from psdr_jit.edges.kind_mirror_horizon import MirrorHorizons
@@ -49,6 +50,10 @@ def mirror_ball() -> mi.Scene:
     return mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant"}, "sensor": sensor}, optimize=False)
 
 
+def blended_grid() -> mi.Scene:
+    return scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=16, normals="smooth")
+
+
 PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
@@ -63,6 +68,7 @@ PLACES = {  # kind: a scene that has it, and what moves there
     RodEdges: ("rod_shadow", ["blocker.control_points"]),
     EllipsoidOutlines: ("ellipsoids_shadow", ["blocker.data"]),
     GridEdges: ("grid_shadow", ["blocker.to_world"]),
+    GridShadingOutlines: (blended_grid, ["blocker.to_world"]),
 }
 
 

@@ -26,18 +26,31 @@ def maps(plugin: str, steepness: float) -> dict:
     return {"type": "twosided", "nested": {"type": plugin, "normalmap": bitmap, "below": {"type": "diffuse"}, **more}}
 
 
-@pytest.mark.parametrize("plugin", ["bumpmap", "normalmap"])
-@pytest.mark.parametrize(("steepness", "elevation", "told"), [(0.3, 60, False), (3.0, 60, True), (3.0, 0, False)])
-def test_steep_maps_are_named_where_they_are_seen_aslant(plugin, steepness, elevation, told):
+def is_told(plugin: str, steepness: float, elevation: float, shape: str, param: str) -> bool:
     T = mi.ScalarTransform4f()
     film = {"type": "hdrfilm", "width": 8, "height": 8}
     pose = T.rotate([0, 1, 0], elevation).look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     sensor = {"type": "perspective", "fov": 30, "to_world": pose, "film": film}
-    sheet = {"type": "rectangle", "bsdf": maps(plugin, steepness)}
-    description = {"type": "scene", "sky": {"type": "constant"}, "sheet": sheet, "sensor": sensor}
+    body = {"type": shape, "bsdf": maps(plugin, steepness)}
+    if shape == "sphere":
+        body["to_world"] = T.rotate([1, 0, 0], 90)  # waves run towards the rim
+    lamp = {"type": "point", "position": [1, 2, 4]}
+    description = {"type": "scene", "sky": {"type": "constant"}, "body": body, "lamp": lamp, "sensor": sensor}
     scene, spec = mi.load_dict(description, optimize=False), {"type": "psdr_path", "max_depth": 2}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        psdr_jit.gradient(scene, "sheet.to_world", (1, 0, 0), integrator=spec, spp=1, seeds=2)
-    found = [w for w in caught if issubclass(w.category, UnsupportedWarning) and plugin in str(w.message)]
-    assert bool(found) == told
+        direction = None if param.endswith("data") else (1, 0, 0)
+        psdr_jit.gradient(scene, param, direction, integrator=spec, spp=1, seeds=2)
+    return any(issubclass(w.category, UnsupportedWarning) and plugin in str(w.message) for w in caught)
+
+
+@pytest.mark.parametrize("plugin", ["bumpmap", "normalmap"])
+@pytest.mark.parametrize(("steepness", "elevation", "told"), [(0.3, 60, False), (3.0, 60, True), (3.0, 0, False)])
+def test_steep_maps_are_named_where_they_are_seen_aslant(plugin, steepness, elevation, told):
+    assert is_told(plugin, steepness, elevation, "rectangle", "body.to_world") == told
+
+
+@pytest.mark.parametrize(("param", "told"), [("body.to_world", True), ("sensor.to_world", True),
+                                             ("lamp.position", False)])  # fmt: skip
+def test_balls_are_named_where_their_rims_move(param, told):
+    assert is_told("normalmap", 1.0, 0, "sphere", param) == told
