@@ -82,6 +82,11 @@ def test_options(variant, options):
     check("mesh", None, True, **options)
 
 
+@pytest.mark.slow
+def test_blended_normals(variant):
+    check("grid", None, True, load={"normals": "smooth"})
+
+
 def test_the_identity_can_fail(llvm):
     """Different seeds are different matrices: the bound tells them apart."""
     scene_name, param, _ = CASES["mesh"]
