@@ -136,7 +136,7 @@ def test_blended_normals_under_a_sky(llvm, values, motion):
     name, direction = MOTIONS[motion]
     moved = perturb(scene_of(values), name, direction=direction)
     spec = {"type": "psdr_path", "max_depth": 2, "rr_depth": 1000}
-    reference = fd(moved, spec, 0.005, 32, 2048)
+    reference = fd(moved, spec, 0.005, 32, 4096)
     slope = gain(forward(moved, spec, 24, 512), reference[0::2], reference[1::2])
     assert slope.stderr < 0.01, slope
     assert abs(slope.value - 1) < 0.01 + 2.5 * slope.stderr, slope
