@@ -95,10 +95,7 @@ class ChainSurfaces:
         if self.grids is not None:
             close &= ~self.grids.bends(number, a.n, b.n) | ~self.grids.step_between(number, a.p, b.p)
         loose = _listed(self.loose, number, both & same)
-        if self.grids is not None:
-            shaded |= loose & ~self.grids.blends(number)
-        else:
-            shaded |= loose
+        shaded |= loose if self.grids is None else loose & ~self.grids.blends(number)
         one_curve = (loose | side) & shaded & (one_face | close | _listed(self.round, number, both & same))
         return same & (~both | dr.select(flat, one_plane & side, one_curve))
 

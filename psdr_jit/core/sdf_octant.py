@@ -33,6 +33,22 @@ class Octant:
     values: dict[tuple[int, int, int], mi.Float]  # by steps −1, 0 and 1 along X, Y and Z
     ends: list[mi.Bool]  # by axis: does the grid end before the cell beyond? It does not count then
 
+    @staticmethod
+    def around(
+        values: mi.Float, first: mi.UInt32, size: mi.UInt32, corner: mi.Vector3i, along: list[mi.Vector3i],
+        active: mi.Bool,
+    ) -> Octant:  # fmt: skip
+        """About the point `corner` of a grid of `size` values a side, which begins at `first` among `values`.
+
+        `along`: X, Y and Z as steps of the grid. Beyond its end, values go on as they are there.
+        """
+        last, found = mi.Int32(size) - 1, {}
+        for step in product((-1, 0, 1), repeat=3):
+            at = corner + along[0] * step[0] + along[1] * step[1] + along[2] * step[2]
+            x, y, z = (mi.UInt32(dr.clip(at[axis], 0, last)) for axis in range(3))
+            found[step] = dr.gather(mi.Float, values, first + x + size * (y + size * z), active)
+        return Octant(found, [dr.any((steps > 0) & (corner == 0)) for steps in along])
+
     @property
     def cell(self) -> Cell:
         """The cell that the octant is a part of, from the same point on."""

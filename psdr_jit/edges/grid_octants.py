@@ -8,24 +8,22 @@ Pure NumPy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 
+from .grid_rows import Columns
+
 
 @dataclass
-class OctantPieces:
+class OctantPieces(Columns):
     """Columns, one entry per piece."""
 
     corner: np.ndarray  # (K, 3) the grid point that the octant is about, along the axes of the grid
     axis: np.ndarray  # (K, 3) axes of the grid: X, Y and Z
     sign: np.ndarray  # (K, 3) ±1: do X, Y and Z point up their axes, or down?
     rises: np.ndarray  # σ
-
-    @staticmethod
-    def joined(parts: list[OctantPieces]) -> OctantPieces:
-        return OctantPieces(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(OctantPieces)))
 
 
 def octant_pieces(values: np.ndarray) -> OctantPieces:

@@ -12,6 +12,7 @@ of which each holds on one side of some X.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,8 +26,19 @@ FLAT = 1e-5
 SHORTEST = 1e-6
 
 
+Pieces = TypeVar("Pieces", bound="Columns")
+
+
+class Columns:
+    """Of a dataclass of arrays, one entry per piece."""
+
+    @classmethod
+    def joined(cls: type[Pieces], parts: list[Pieces]) -> Pieces:
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+
 @dataclass
-class GridPieces:
+class GridPieces(Columns):
     """Columns, one entry per piece. X, Y, Z are axes of the grid in the order that a row has them in."""
 
     part: np.ndarray  # OUTLINE, CREASE or BORDER
@@ -40,10 +52,6 @@ class GridPieces:
     start: np.ndarray  # parameter at which it begins ...
     length: np.ndarray  # ... and how far it goes
     weight: np.ndarray  # length × angle by which the surface turns there, in cells and radians
-
-    @staticmethod
-    def joined(parts: list[GridPieces]) -> GridPieces:
-        return GridPieces(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(GridPieces)))
 
 
 def grid_pieces(values: np.ndarray) -> GridPieces:

@@ -85,18 +85,22 @@ class GridSet:
 
     def frame(self, rows: GridRows, active: mi.Bool) -> Frame:
         """The cell of rows: of a face, that above it."""
-        columns = [dr.gather(mi.Vector3f, c, rows.grid, active) for c in self.columns]
-        inverse = [dr.gather(mi.Vector3f, c, rows.grid, active) for c in self.inverse]
-        size = dr.gather(mi.UInt32, self.size, rows.grid, active)
-        size = dr.select(active, size, 2)
+        size = dr.select(active, dr.gather(mi.UInt32, self.size, rows.grid, active), 2)
         k = rows.base - dr.gather(mi.UInt32, self.first, rows.grid, active)
         corner = mi.Vector3f(k % size, (k // size) % size, k // (size * size))
-        cells = mi.Float(size - 1)
-        axis = [rows.x, rows.y, rows.z]
+        return self.frame_at(rows.grid, corner, [rows.x, rows.y, rows.z], active)
+
+    def frame_at(
+        self, grid: mi.UInt32, corner: mi.Vector3f, axis: list[mi.UInt32], active: mi.Bool, sign=(1.0, 1.0, 1.0)
+    ) -> Frame:
+        """From the point `corner` of a grid, along its axes `axis`; `sign`: ±1, up them or down."""
+        columns = [dr.gather(mi.Vector3f, c, grid, active) for c in self.columns]
+        inverse = [dr.gather(mi.Vector3f, c, grid, active) for c in self.inverse]
+        cells = mi.Float(dr.select(active, dr.gather(mi.UInt32, self.size, grid, active), 2) - 1)
         return Frame(
             origin=mi.Point3f(columns[3] + sum(columns[a] * corner[a] for a in range(3)) / cells),
-            axes=[_picked(columns, a) / cells for a in axis],
-            duals=[_picked(inverse, a) * cells for a in axis],
+            axes=[_picked(columns, a) * s / cells for a, s in zip(axis, sign, strict=True)],
+            duals=[_picked(inverse, a) * s * cells for a, s in zip(axis, sign, strict=True)],
             corner=corner,
             axis=axis,
         )

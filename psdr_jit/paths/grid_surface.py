@@ -7,8 +7,6 @@ may be blended (`core.sdf_octant`).
 
 from __future__ import annotations
 
-from itertools import product
-
 import drjit as dr
 import mitsuba as mi
 
@@ -70,12 +68,8 @@ class _Field:
 
     def blended(self, q: mi.Point3f) -> mi.Vector3f:
         """Mitsuba's smooth normal, of any length."""
-        middle = [dr.round(dr.detach(a)) for a in (q.x, q.y, q.z)]
-        sign = [dr.select(dr.detach(q[k]) >= middle[k], mi.Float(1), -1) for k in range(3)]
-        last, size, values = mi.Float(self.cells), self.cells + 1, {}
-        for step in product((-1, 0, 1), repeat=3):
-            at = [mi.UInt32(dr.clip(middle[k] + sign[k] * step[k], 0, last)) for k in range(3)]
-            values[step] = dr.gather(mi.Float, self.values, at[0] + size * (at[1] + size * at[2]), self.active)
-        octant = Octant(values, [(sign[k] > 0) & (middle[k] < 1) for k in range(3)])
-        n = octant.blended(mi.Vector3f(*((q[k] - middle[k]) * sign[k] for k in range(3))))
-        return mi.Vector3f(*(n[k] * sign[k] for k in range(3)))
+        middle = dr.round(dr.detach(mi.Vector3f(q)))
+        sign = dr.select(dr.detach(mi.Vector3f(q)) >= middle, mi.Vector3f(1), -1)
+        along = [mi.Vector3i(*(mi.Int32(sign[k]) if axis == k else 0 for axis in range(3))) for k in range(3)]
+        octant = Octant.around(self.values, mi.UInt32(0), self.cells + 1, mi.Vector3i(middle), along, self.active)
+        return octant.blended((mi.Vector3f(q) - middle) * sign) * sign
