@@ -25,7 +25,7 @@ from benchmarks.measure import (
     timed,
 )
 from psdr_jit.derivative import integrator_specs
-from psdr_jit.derivative.finite_differences import FD_SEED, CentralDifference
+from psdr_jit.derivative.finite_differences import FD_SEED, OWN, CentralDifference
 from psdr_jit.derivative.perturbation import Perturbation
 from psdr_jit.errors import PsdrError
 from psdr_jit.scene import io as scene_io
@@ -124,8 +124,11 @@ def mitsuba_integrator(plugin: str, tuning: dict[str, Any] | None = None, **opti
 
 
 def finite_differences(problem: Problem, budget: float, max_first: float) -> Renders:
-    """Central differences of `path` with common random numbers; setting the scene is part of the time."""
-    difference = CentralDifference(problem.motion, problem.case.limits)
+    """Central differences of `path` with common random numbers, by the sampler that the scene has, as users take them.
+
+    Setting the scene is part of the time.
+    """
+    difference = CentralDifference(problem.motion, problem.case.limits, sampler=OWN)
 
     def render(seed: int) -> tuple[np.ndarray, float]:
         (image,), seconds = timed(lambda: difference.differences([FD_METHOD_SEED + seed]))

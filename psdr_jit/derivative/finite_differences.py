@@ -2,7 +2,7 @@
 
 f = [I(theta + eps) - I(theta - eps)] / (2 eps), both sides rendered with the same seed so that the noise of
 what does not change cancels. The bias is O(eps^2), the variance grows as 1/eps where edges move, hence eps is
-chosen per parameter and recorded with the result.
+chosen per parameter and recorded with the result. Samples of a pixel are stratified, whatever sampler the scene has.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from psdr_jit.core.film import require_samples
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.derivative.statistics import GroupedImages, Unseen, block_means, standard_error
+from psdr_jit.derivative.stratified_sensor import SAMPLER, stratified, stratified_count
 from psdr_jit.errors import OptionError
 from psdr_jit.scene.curve_ends import pad_curves
 
@@ -30,6 +31,7 @@ VALUE_STEP = 0.01       # relative change of colours, radiances, roughnesses
 CAMERA_STEP = 0.002     # relative change of camera intrinsics: 0.1 px at the border of 100 px
 PATHS_PER_RENDER = 1 << 18   # default spp: as many paths as keep start-up costs below the tracing itself
 SEEN_GRID = 16          # camera rays along each side of the film that tell how far away things are
+OWN = ""                # in place of a sampler: the sensor's own
 FD_SEED = 0x5EED0000    # reference seeds start here, far from the seeds of the estimator
 
 
@@ -53,10 +55,13 @@ class FiniteDifferences:
 
 
 class CentralDifference:
-    """Adds seeds to two independent halves of a central difference, as many as one asks for."""
+    """Adds seeds to two independent halves of a central difference, as many as one asks for.
+
+    `sampler`: plugin that draws the random numbers; `OWN`: that of the sensor. It may ask for a few more than `spp`.
+    """
 
     def __init__(self, perturbation: Perturbation, spec: dict[str, Any], sensor: int = 0,
-                 spp: int | None = None, eps: float | None = None, groups: int = 32) -> None:
+                 spp: int | None = None, eps: float | None = None, groups: int = 32, sampler: str = SAMPLER) -> None:
         if spp is not None and spp <= 0:
             raise OptionError(f"spp must be positive, got {spp}")
         if eps is not None and not eps > 0:
@@ -69,6 +74,10 @@ class CentralDifference:
         self.eps = eps or default_step(perturbation, self.sensor)
         self.spp = spp or default_spp(self.sensor)
         require_samples(self.sensor, self.spp)
+        self._view = self.sensor
+        if sampler != OWN and not integrator_specs.draws_itself(self.integrator):
+            self.spp = stratified_count(self.spp)
+            self._view = stratified(self.sensor, self.spp, sampler)
         self.halves = (GroupedImages(groups), GroupedImages(groups))
         self.primal, self._primal_squares = GroupedImages(groups=1), GroupedImages(groups=1)
         self.seconds = 0.0
@@ -145,7 +154,7 @@ class CentralDifference:
 
     def _render(self, seed: int) -> np.ndarray:
         with dr.suspend_grad():
-            image = self.integrator.render(self.scene, self.sensor, seed=seed, spp=self.spp)
+            image = self.integrator.render(self.scene, self._view, seed=seed, spp=self.spp)
         return integrator_specs.to_image(image)
 
     def result(self, block: int) -> FiniteDifferences:

@@ -134,6 +134,13 @@ def reference(spec: Mapping[str, Any], scene: Any) -> Any:
     return build({"type": image_plugin(scene, bool(options.get("hide_emitters", False))), **options})
 
 
+def draws_itself(integrator: Any) -> bool:
+    """Does it draw its random numbers itself, whatever sampler the sensor has? Mitsuba's scalar variants go through
+    Python for every ray if asked for another sampler, so they count as well.
+    """
+    return mi.variant().startswith("scalar") or hasattr(integrator, "options")
+
+
 def rejected(integrator: Any) -> int | None:
     """Samples dropped as not finite so far, if the integrator counts them (`stats.rejected`)."""
     stats = getattr(integrator, "stats", None)
