@@ -69,7 +69,7 @@ def readme_charts(found: list[dict[str, Any]]) -> str:
         return EMPTY
     on_cuda = stored_rows(rows.RESULTS / CUDA)
     places = [sentences.machines(shown), sentences.on_cuda(on_cuda)]
-    places.append(sentences.lists_words(grouped(on_cuda).get("check_lists", [])))
+    places.append(sentences.lists_words(sentences.lists_anywhere(of.get("check_lists", []), on_cuda)))
     return "\n\n".join(blocks) + "\n" + " ".join(filter(None, places))
 
 

@@ -108,6 +108,12 @@ def has_signal(row: Row) -> bool:
     return not row["reason"].startswith(NO_SIGNAL)
 
 
+def lists_anywhere(here: list[Row], on_cuda: list[Row]) -> list[Row]:
+    """Rows of lists of checks: those made here, and those of lists that were run on a device only."""
+    known = {row["settings"]["list"] for row in here}
+    return [*here, *(row for row in on_cuda if row["bench"] == "check_lists" and row["settings"]["list"] not in known)]
+
+
 def lists_words(rows: list[Row]) -> str:
     """What the checks of lists came to: how many are known well, and by how much these are off; empty without rows."""
     found = []
@@ -117,9 +123,10 @@ def lists_words(rows: list[Row]) -> str:
         known = [row for row in listed if row["gain_stderr"] <= bound and has_signal(row)]
         off = max((abs(row["gain"] - 1) for row in known), default=0)
         failed = sum(row["verdict"] == "fail" for row in listed)
-        words = f"of {len(listed)} of `{name}` {len(known)} have a standard error of at most {bound:g}"
+        where = " (on the GPU)" if listed[0]["machine"].get("gpu") else ""
+        words = f"of {len(listed)} of `{name}`{where} {len(known)} have a standard error of at most {bound:g}"
         found.append(f"{words} and are off by at most {off:.3f}, {failed} fail")
-    return f"Lists of checks there, gains against differences: {'; '.join(found)}." if found else ""
+    return f"Lists of checks, gains against differences: {'; '.join(found)}." if found else ""
 
 
 def on_cuda(rows: list[Row]) -> str:

@@ -31,6 +31,7 @@ BESIDE = (1.3, 0.4, -0.7)  # a point of the axis that bodies turn about
 STEP = 0.004  # of differences: a thirtieth of a pixel, which a blurred outline hardly shows
 VERTEX_STEP = 0.02  # the same in edges of the mesh
 SEEN_EDGES = 6.0  # width of the view of a vertex that moves
+SKY = {"sky": {"type": "constant", "radiance": 0.5}}  # behind it, where little else has light
 
 
 def round_mesh(segments: int) -> tuple[np.ndarray, np.ndarray]:
@@ -81,11 +82,11 @@ MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
 }
 
 
-def smooth_scene(mesh: str, material: str, depth: int, camera: Callable[[], dict]) -> mi.Scene:
+def smooth_scene(mesh: str, material: str, depth: int, camera: Callable[[], dict], around: dict) -> mi.Scene:
     points, faces = MESHES[mesh]()
     shape = meshes.smooth_mesh("shape", points, faces, mi.load_dict(MATERIALS[material][0]))
     lights = {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
-    return scene_of(depth, camera(), shape=shape, floor=ground(-1.3), **lights)
+    return scene_of(depth, camera(), shape=shape, floor=ground(-1.3), **lights, **around)
 
 
 def smooth() -> Iterator[Listed]:
@@ -102,7 +103,8 @@ def smooth() -> Iterator[Listed]:
         for material, (_, depths) in MATERIALS.items():
             for how, (motion, camera) in motions.items():
                 for depth in depths:
-                    scene = partial(smooth_scene, mesh, material, depth, camera)
+                    around = SKY if how == "vertex" else {}
+                    scene = partial(smooth_scene, mesh, material, depth, camera, around)
                     yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
 
 

@@ -30,6 +30,7 @@ from psdr_jit.setup import drjit_libraries, llvm, quick_compile
 NAME = "test"
 HELP = "run the test suite (needs a clone)"
 
+NO_BYTECODE, BYTECODE_FOLDER = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"  # Python's own
 EXIT_STATUS = {0: 0, 4: 2, 5: 2}  # pytest: all passed; wrong usage; nothing selected
 
 
@@ -55,8 +56,15 @@ def environment() -> dict[str, str]:
 
 
 def environment_of_tests() -> dict[str, str]:
-    """Kernels of tests run once or twice: to compile them is most of the time that the suite takes."""
-    return quick_compile.of_child(environment())
+    """Kernels of tests run once or twice: to compile them is most of the time that the suite takes.
+
+    Tests start many Python processes. Where Python is told to leave no bytecode beside sources, it goes to a folder of
+    its own, or every process would compile all modules.
+    """
+    child = quick_compile.of_child(environment())
+    if child.pop(NO_BYTECODE, ""):
+        child.setdefault(BYTECODE_FOLDER, os.path.join(quick_compile.own_cache(), "bytecode"))
+    return child
 
 
 def run(args: argparse.Namespace) -> int:

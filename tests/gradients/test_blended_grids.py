@@ -11,6 +11,7 @@ import pytest
 from helpers import fd, forward
 from test_distance_grids import blob, grid, torus
 from test_linear_curves import EYE
+from variants import also
 
 from psdr_jit import make_plan
 from psdr_jit.core.memory import Memory
@@ -66,7 +67,7 @@ def crossings(scene: mi.Scene, d: mi.Vector3f, right: mi.Vector3f, up: mi.Vector
     return float(((h[:, 1:] * h[:, :-1] < 0) & one_surface).sum() * WINDOW / LINES)
 
 
-@pytest.mark.parametrize("values", [torus(12), blob(20)], ids=["torus", "blob"])
+@pytest.mark.parametrize("values", [torus(12), also(blob(20))], ids=["torus", "blob"])
 def test_curves_are_found_where_shading_turns_away(llvm, values):
     """Points lie on the surface where Mitsuba's normal turns away; the length of what is seen, against counting."""
     scene, samples = alone(values), 256

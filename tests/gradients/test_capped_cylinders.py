@@ -33,7 +33,7 @@ def can(camera: tuple[float, float, float], ends: int = 1) -> mi.Scene:
     }, optimize=False)  # fmt: skip
 
 
-CASES = [("above", "sensor.to_world"), also("above", "lamp.to_world"), also("level", "sensor.to_world"),
+CASES = [also("above", "sensor.to_world"), also("above", "lamp.to_world"), also("level", "sensor.to_world"),
          also("level", "lamp.to_world")]  # fmt: skip
 FROM = {"above": (0.2, 1.8, 3.5), "level": (0.2, 0.3, 4.0)}
 

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import forward, mesh_of
+from variants import also
 
 from psdr_jit.derivative.perturbation import perturb
 
@@ -90,7 +91,7 @@ def outline_on_film(points: np.ndarray, faces: np.ndarray, eye: np.ndarray, fram
     return image
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, also(1), also(2)])
 def test_a_fine_ball_before_a_bright_sky(llvm, seed):
     """A third of a quad that was seen all but edge-on was taken for hidden: 5 % of a pixel."""
     turned, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))

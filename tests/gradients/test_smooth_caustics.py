@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import adjoint_identity, assert_grad_close, forward, functionals, images, z_scores
+from variants import also
 
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.finite_differences import CentralDifference
@@ -86,7 +87,7 @@ def differences(motion, spec: dict, eps: float, spp: int) -> np.ndarray:
     return np.concatenate([half.group_means() for half in difference.halves])
 
 
-@pytest.mark.parametrize("light_paths", ["auto", "only"])
+@pytest.mark.parametrize("light_paths", ["auto", also("only")])
 @pytest.mark.parametrize("light", ["card", pytest.param("bulb", marks=SLOW)])
 def test_image_of_an_area_light(llvm, light, light_paths):
     """Weights of both ways add up to one, whatever is found by whom."""

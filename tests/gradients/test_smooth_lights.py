@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import adjoint_identity, fd, forward
 from test_smooth_meshes import smooth_mesh
+from variants import also
 
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import gain
@@ -107,8 +108,8 @@ def turned(axis: tuple[float, ...]) -> Callable[[float], tuple[np.ndarray, np.nd
 
 MOTIONS = [
     pytest.param(moved, {"direction": (0, 0, 1)}, id="up"),
-    pytest.param(moved, {"direction": (1, 0, 0)}, id="aside"),
-    pytest.param(turned, {"rotate": (0, 0, 1)}, id="turned"),
+    pytest.param(moved, {"direction": (1, 0, 0)}, id="aside", marks=pytest.mark.slow),
+    pytest.param(turned, {"rotate": (0, 0, 1)}, id="turned", marks=pytest.mark.slow),
 ]
 
 
@@ -119,7 +120,7 @@ def rendered(how: dict, **options) -> np.ndarray:
     return forward(motion, spec, 8, 4096).mean(axis=(1, 2)).ravel()
 
 
-@pytest.mark.parametrize("form", ["spatial", "material"])
+@pytest.mark.parametrize("form", [also("spatial"), "material"])
 @pytest.mark.parametrize("kind, how", MOTIONS)
 def test_a_floor_beneath(llvm, kind, how, form):
     """`direct` is 10 to 90 % of it: what is sent along the planes of faces."""

@@ -57,7 +57,7 @@ def derivative(scene: mi.Scene, unit: float, param: str, direction: tuple[float,
     return unit * forward(motion, {"type": "psdr_path", "max_depth": 2}, SEEDS, SPP).mean(0)
 
 
-@pytest.mark.parametrize("elevation", ELEVATIONS)
+@pytest.mark.parametrize("elevation", [ELEVATIONS[0], *(also(e) for e in ELEVATIONS[1:])])
 @pytest.mark.parametrize("unit", [also(0.5), also(1.0), 500.0])
 @pytest.mark.parametrize("what", ["box", "tube"])
 def test_a_foot_is_seen_against_the_floor(llvm, what, unit, elevation):

@@ -22,7 +22,7 @@ def test_cases(llvm, name):
 
 def row(gain: float, stderr: float, reason: str = "", verdict: str = "pass") -> dict:
     return {"settings": {"list": "smooth", "max_stderr": 0.004}, "gain": gain, "gain_stderr": stderr, "reason": reason,
-            "verdict": verdict}  # fmt: skip
+            "verdict": verdict, "machine": {}, "bench": "check_lists"}  # fmt: skip
 
 
 def test_what_is_not_known_does_not_count():
@@ -30,3 +30,10 @@ def test_what_is_not_known_does_not_count():
     said = sentences.lists_words([row(1.003, 0.002), row(0.99, 0.004, verdict="fail"), noisy, zero])
     assert "of 4 of `smooth` 2 have a standard error of at most 0.004 and are off by at most 0.010, 1 fail" in said
     assert sentences.lists_words([]) == ""
+
+
+def test_rows_from_here_come_before_those_of_a_device():
+    on_device = {**row(1.0, 0.001), "machine": {"gpu": "one"}}
+    other = {**on_device, "settings": {"list": "patterns", "max_stderr": 0.007}}
+    assert sentences.lists_anywhere([row(1.0, 0.002)], [on_device, other]) == [row(1.0, 0.002), other]
+    assert "of 1 of `patterns` (on the GPU) 1 have" in sentences.lists_words([other])
