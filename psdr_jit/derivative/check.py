@@ -101,7 +101,8 @@ def check_gradient(scene: Any, param: str | Perturbation, direction: Any = None,
     The reference is Mitsuba's `path` with the max_depth, rr_depth and hide_emitters of `integrator`. Seeds go
     to whichever of the two lowers the error of the gain more per second. Only terms of the estimate that are
     implemented are in it: where others matter, the check fails, and should. `reference_spp`: of a rendering of the
-    reference; by default so many that start-up costs little, fewer if there is no time for a verdict otherwise.
+    reference, whose samples are stratified; by default so many that start-up costs little, fewer if there is no time
+    for a verdict otherwise.
 
     `progress(seconds, verdict)` is called after every batch of seeds; True shows a bar, None does so in notebooks.
     `client`, `source`: as in `gradient`.

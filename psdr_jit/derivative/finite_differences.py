@@ -170,7 +170,8 @@ def finite_differences(scene: Any, param: str | Perturbation, direction: Any = N
     """Central differences of the scene under Mitsuba's `path`, in two independent halves.
 
     `integrator` (spec dict, plugin name or None) only lends its max_depth, rr_depth and hide_emitters.
-    `seeds` counts per half; each seed costs four renderings of `spp` samples per pixel.
+    `seeds` counts per half; each seed costs four renderings of `spp` samples per pixel, or the few more that
+    `stratified_count` says.
     """
     if seeds < 1:
         raise OptionError(f"seeds must be positive, got {seeds}")

@@ -13,7 +13,7 @@ from typing import Any
 
 import mitsuba as mi
 
-SAMPLER = "multijitter"  # correlated multi-jittered: every pair of dimensions is stratified [Kensler 2013]
+SAMPLER = "multijitter"  # correlated multi-jittered: numbers drawn in pairs are stratified in both [Kensler 2013]
 
 
 def stratified_count(spp: int) -> int:

@@ -27,7 +27,7 @@ def images(scene: mi.Scene, sensor: mi.Sensor, first: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("spp", (1, 2, 7, 16, 141, 1000))
 def test_count_is_what_mitsuba_rounds_to(llvm, spp):
     count = stratified_count(spp)
-    assert spp <= count <= spp + np.sqrt(spp)
+    assert spp <= count <= spp + np.sqrt(spp) and stratified_count(count) == count
     assert mi.load_dict({"type": "multijitter", "sample_count": count}).sample_count() == count
 
 
