@@ -7,7 +7,7 @@ import pytest
 from helpers import assert_grad_close, fd, forward, load, motion_of, spec_of
 from problems import PROBLEMS, Problem
 
-FAST = dict(seeds=16, spp=16, reference_seeds=24, reference_spp=128, max_stderr=0.06)
+FAST = dict(seeds=16, spp=16, reference_seeds=12, reference_spp=128, max_stderr=0.06)
 SLOW = dict(seeds=64, spp=64, reference_seeds=256, reference_spp=256, max_stderr=0.01)
 
 
