@@ -212,3 +212,12 @@ def test_pytest_arguments_pass_through(monkeypatch) -> None:
     monkeypatch.setattr(test_command.subprocess, "run", run)
     assert main.main(["test", "-k", "edges", "--collect-only"]) == 2
     assert seen[0][1:] == ["-m", "pytest", "-k", "edges", "--collect-only"]
+
+
+def test_bytecode_of_tests_has_a_folder_of_its_own_where_sources_have_none(monkeypatch):
+    monkeypatch.delenv(test_command.BYTECODE_FOLDER, raising=False)
+    monkeypatch.delenv(test_command.NO_BYTECODE, raising=False)
+    assert test_command.BYTECODE_FOLDER not in test_command.environment_of_tests()
+    monkeypatch.setenv(test_command.NO_BYTECODE, "1")
+    child = test_command.environment_of_tests()
+    assert child[test_command.BYTECODE_FOLDER].endswith("bytecode") and test_command.NO_BYTECODE not in child
