@@ -1,7 +1,7 @@
 """A sensor that sees what another one sees, by stratified random numbers.
 
 What moves a little changes few samples of a pixel, and a sampler that stratifies leaves less to chance where these lie:
-differences with common random numbers have a half to a tenth of the variance in the same time, the more samples the
+differences with common random numbers have a half to a twentieth of the variance in the same time, the more samples the
 less. Outlines gain the most, shadows of wide lamps and longer paths the least.
 """
 

@@ -8,7 +8,7 @@ import pytest
 
 from psdr_jit.derivative.finite_differences import OWN, CentralDifference
 from psdr_jit.derivative.perturbation import Perturbation, perturb
-from psdr_jit.derivative.stratified_sensor import stratified, stratified_count
+from psdr_jit.derivative.stratified_sensor import SAMPLER, stratified, stratified_count
 from psdr_jit.scene import io as scene_io
 
 SPP, SEEDS, SIDE = 64, 12, 8
@@ -28,7 +28,7 @@ def images(scene: mi.Scene, sensor: mi.Sensor, first: int = 0) -> np.ndarray:
 def test_count_is_what_mitsuba_rounds_to(llvm, spp):
     count = stratified_count(spp)
     assert spp <= count <= spp + np.sqrt(spp) and stratified_count(count) == count
-    assert mi.load_dict({"type": "multijitter", "sample_count": count}).sample_count() == count
+    assert mi.load_dict({"type": SAMPLER, "sample_count": count}).sample_count() == count
 
 
 @pytest.mark.parametrize("name", ("area_shadow", "thinlens_shadow", "camera_crop", "camera_orthographic"))
@@ -58,11 +58,11 @@ def test_it_follows_the_sensor_and_leaves_it_alone(variant):
 def test_differences_have_less_noise(variant):
     """Of what an outline uncovers: less than half."""
     noise = {}
-    for sampler in (OWN, "multijitter"):
+    for sampler in (OWN, SAMPLER):
         motion = perturb(scene("emissive_card"), "card.vertex_positions", (1, 0.3, 0))
         difference = CentralDifference(motion, {"max_depth": 2}, 0, 256, sampler=sampler)
         noise[sampler] = np.array(difference.differences(range(SEEDS))).var(0).mean()
-    assert 0 < noise["multijitter"] < 0.5 * noise[OWN]
+    assert 0 < noise[SAMPLER] < 0.5 * noise[OWN]
 
 
 def test_light_subpaths_keep_their_sensor(variant):
@@ -71,8 +71,9 @@ def test_light_subpaths_keep_their_sensor(variant):
     found = mi.load_dict({"type": "scene", "mirror": mirror, "lamp": {"type": "point", "position": [0, 0, 1]},
                           "camera": {"type": "perspective"}}, optimize=False)  # fmt: skip
     motion = perturb(found, "mirror.to_world", (1, 0, 0))
-    assert not_stratified(motion, "psdr_bdpt") and not not_stratified(motion, "psdr_path")
+    assert samples_of(motion, "psdr_bdpt", 7) == 7
+    assert samples_of(motion, "psdr_path", 7) == stratified_count(7) != 7
 
 
-def not_stratified(motion: Perturbation, plugin: str) -> bool:
-    return CentralDifference(motion, {"type": plugin, "max_depth": 3}, spp=7).spp == 7
+def samples_of(motion: Perturbation, plugin: str, spp: int) -> int:
+    return CentralDifference(motion, {"type": plugin, "max_depth": 3}, spp=spp).spp
