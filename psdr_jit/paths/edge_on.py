@@ -1,8 +1,9 @@
-"""What a sphere or cylinder of mirror or glass shows at its outline, where it is met edge-on.
+"""What a sphere or cylinder shows at its outline, where it is met edge-on.
 
 Steps are looked at a little beside an edge. A distance s inside of the outline of a sphere of radius R, its surface is
-met at the cosine c = √(2 s/R), which falls much more slowly than s: what is 10⁻⁴ R off the outline is met at .014. Most
-surfaces are the same there, but smooth glass with its reflectance 1 − O(c) (Fresnel) has left the limit 1 by 7 % then.
+met at the cosine c = √(2 s/R), which falls much more slowly than s: what is 10⁻⁴ R off the outline is met at .014. Its
+normal is turned by as much, which changes what a lamp at 60° to it brings by 2 % (of a lit ball's derivative, moved,
+that was a quarter of a percent); and smooth glass with its reflectance 1 − O(c) (Fresnel) has left the limit 1 by 7 %.
 The interior term has the whole fall from 1, up to where it ends (`GRAZING`); a step with less than the limit would have
 a part of it twice. So walks from beside an edge meet such a surface at that cosine, and in the point of contact: what
 is mirrored goes straight on there, which from the point that was met leads through the surface once more.
@@ -47,7 +48,7 @@ class EdgeOn:
     @staticmethod
     def of(scene: mi.Scene, facts: SceneFacts) -> EdgeOn | None:
         """None where there are none."""
-        chosen = [s for s in facts.shapes if s.index >= 0 and s.plugin in ROUND and s.delta_lobes]
+        chosen = [s for s in facts.shapes if s.index >= 0 and s.plugin in ROUND and not s.black]
         if not chosen:
             return None
         place = registry_values(scene, {s.index: i + 1 for i, s in enumerate(chosen)})

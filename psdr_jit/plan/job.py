@@ -169,10 +169,9 @@ class Job:
     @property
     def limits_beside(self) -> PathLimits:
         """Limits of walks from beside an edge, which are compared."""
-        if not self.facts.has_delta_lobes:
-            return self.limits
         edge_on = self.shared.once(EDGE_ON, lambda: EdgeOn.of(self.scene, self.facts))
-        return replace(self.limits, aligned=True, edge_on=edge_on)
+        limits = self.limits if edge_on is None else replace(self.limits, edge_on=edge_on)
+        return replace(limits, aligned=True) if self.facts.has_delta_lobes else limits
 
 
 def surfaces_of_call(call: Call, facts: SceneFacts, shared: Memory) -> Surfaces | None:

@@ -1,0 +1,42 @@
+"""What walks from beside the outline of a sphere or cylinder meet: the outline's limit, whatever its material."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from psdr_jit.paths.edge_on import GRAZING, EdgeOn
+from psdr_jit.scene.facts import analyse
+
+RADIUS, INSIDE = 0.5, 1e-4  # of the radius: where walks begin
+BLACK = {"type": "diffuse", "reflectance": 0.0}
+
+
+def scene_of(shape: str, bsdf: dict) -> mi.Scene:
+    pose = mi.ScalarTransform4f().scale([RADIUS] * 3)
+    return mi.load_dict({"type": "scene", "body": {"type": shape, "to_world": pose, "bsdf": bsdf},
+                         "camera": {"type": "perspective"}}, optimize=False)  # fmt: skip
+
+
+def edge_on_of(scene: mi.Scene) -> EdgeOn | None:
+    return EdgeOn.of(scene, analyse(scene, scene.sensors()[0]))
+
+
+@pytest.mark.parametrize("bsdf", [{"type": "diffuse"}, {"type": "dielectric"}], ids=lambda bsdf: bsdf["type"])
+@pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+def test_normals_beside_an_outline_are_those_of_the_outline(llvm, shape, bsdf):
+    """Without, they are turned by √(2 · INSIDE)."""
+    scene = scene_of(shape, bsdf)
+    d = mi.Vector3f(0, 1, 0)
+    ray = mi.Ray3f(mi.Point3f(RADIUS * (1 - INSIDE), -5, 0.0 if shape == "sphere" else 0.2), d)
+    si = scene.ray_intersect(ray)
+    assert abs(float(si.sh_frame.n.y[0])) == pytest.approx(np.sqrt(2 * INSIDE), rel=0.03)  # rounding
+    seen = edge_on_of(scene).at_limit(si, d, mi.Bool(True))
+    assert np.array(seen.p)[:2].ravel() == pytest.approx([RADIUS, 0], abs=5e-6)
+    assert np.array(seen.sh_frame.n)[:, 0] == pytest.approx([1, -GRAZING, 0], abs=5e-6)
+
+
+def test_a_surface_that_scatters_nothing_has_no_such_limit(llvm):
+    assert edge_on_of(scene_of("sphere", BLACK)) is None
+    assert edge_on_of(scene_of("rectangle", {"type": "diffuse"})) is None
