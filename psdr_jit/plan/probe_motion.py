@@ -50,6 +50,8 @@ class ProbeMotion(Motion):
             yield ProbeDisplacements(self, v, w)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        if not self.camera:
+            return mi.Vector3f(0), mi.Vector3f(0)
         o, d = dr.detach(ray.o), dr.detach(ray.d)
         return self.shift + dr.cross(self.turn, o - self.centre), dr.cross(self.turn, d)
 
