@@ -191,7 +191,7 @@ def forward(job: Job) -> mi.TensorXf:
                 continue
             steps, chain = found
             camera = mi.Vector3f(0), mi.Vector3f(0)
-            if job.facts.camera_moves:
+            if job.facts.view_moves:
                 with job.motion.attached() as moving:
                     camera = tangents(*_camera(moving, steps, chain))
             F_grad = slope_at_end(job.facts, chain, steps.end, camera, job.motion)
@@ -219,7 +219,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
             λ = share * adjoint_of_speed(lambda F_θ: _splat(job, steps, steps.value * F_θ), count, grad_in)
             λ = rejected.keep_finite(mi.Color1f(λ)).x
             λ_o, λ_d = adjoints_at_start(part.facts, chain, steps.end, λ, job.motion, rejected)
-            if job.facts.camera_moves:
+            if job.facts.view_moves:
                 with job.motion.attached() as moving:
                     start, direction = _camera(moving, steps, chain)
                     accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))

@@ -72,7 +72,7 @@ class ChainWorld:
             surfaces=ChainSurfaces.of(job),
             patterns=ChainPatterns.of(job),
             moving=registry_table(job.scene, changing),
-            camera=varying(mi.Bool, facts.camera_moves),
+            camera=varying(mi.Bool, facts.view_moves),
             lights=varying(mi.Bool, lights),
             connects=compare_light,
             scatters=facts.scatters,

@@ -17,6 +17,7 @@ from ..plan.plan import Plan, TermPlan
 from ..plan.probe_motion import probe_motion
 from ..scene.facts import SceneFacts
 from ..scene.mesh_tables import CallVariables
+from ..scene.registry import registry_table
 
 #: Of one render call: the motion of everything that can move, once it has been asked for.
 PROBE: Slot[Motion | None] = Slot(lambda: None)
@@ -60,7 +61,10 @@ class Question:
         return self.shared.once(FOLLOWED, lambda: replace(self.facts, places_move=True))
 
     def _flow_of(self, motion: Motion) -> FilmFlow:
-        return FilmFlow.of(self.call.scene, self.call.sensor, self.call.film, motion)
+        moving = None
+        if not self.facts.camera_moves:
+            moving = registry_table(self.call.scene, {s.index for s in self.facts.shapes if s.moves})
+        return FilmFlow.of(self.call.scene, self.call.sensor, self.call.film, motion, moving)
 
     def probe_of(self, plan: Plan) -> Motion:
         """The motion of everything that can move, as the plan's form has it: seen from places that follow, or rest."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -45,6 +45,15 @@ class CameraPass:
     def sampler(self, lane: mi.UInt32) -> LaneSampler:
         """What is random about the paths of these samples."""
         return self.samples.sampler(self.seed, lane)
+
+    def of(self, lane: mi.UInt32) -> CameraPass:
+        """What is known of the samples `lane`, in place of all: rays, weights and places on the film."""
+        if dr.width(lane) == self.count:
+            return self
+        at = films.FilmPoints(dr.gather(mi.Point2f, self.at.p, lane), dr.gather(mi.Float, self.at.weight, lane), False)
+        ray, weight = dr.gather(type(self.ray), self.ray, lane), dr.gather(mi.Spectrum, self.weight, lane)
+        per_px = None if self.per_px is None else dr.gather(type(self.per_px), self.per_px, lane)
+        return replace(self, ray=ray, weight=weight, at=at, per_px=per_px)
 
     def develop(self, film: mi.Film, value: mi.Spectrum) -> mi.TensorXf:
         """Image of what the samples bring."""

@@ -52,7 +52,7 @@ def every_path_differs(job: Job) -> bool:
     """True if even a path that meets no enabled shape has a derivative: camera and light reach everything."""
     facts = job.facts
     emission = any(e.pose or e.radiance for e in facts.emitters)
-    return facts.view_moves or emission or _area_lights_change(facts) or not job.plan.prunes
+    return facts.camera_moves or emission or _area_lights_change(facts) or not job.plan.prunes
 
 
 def _area_lights_change(facts: SceneFacts) -> bool:
@@ -107,6 +107,8 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
     if looks and job.call.memory[TOUCHED_SHARE] < MOST_PATHS:
         sampler = p.sampler(lane)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
+        if job.film_flow is not None:
+            found |= job.film_flow.may_move(p.at.p)
         lane = dr.compress(found)
         job.call.memory[TOUCHED_SHARE] = dr.width(lane) / dr.width(found)
         if dr.width(lane) == 0:
@@ -162,9 +164,10 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
     if dr.width(lane) == 0:
         return p.develop(job.film, dL)
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
+    known = p if job.film_flow is None else p.of(lane)
     if job.facts.view_moves:
-        o_grad, d_grad = _camera_tangents(job, p)
-        o_grad = o_grad + _skipped(job, p, records) * d_grad
+        o_grad, d_grad = _camera_tangents(job, known)
+        o_grad = o_grad + _skipped(job, known, records) * d_grad
     recorded, L = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
     keep_finite = job.call.counters.rejected.keep_finite
     dr.scatter(dL, keep_finite(recorded), lane)
@@ -173,7 +176,7 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
         return p.develop(job.film, dL)
     L = keep_finite(L)
     dr.eval(dL, L)
-    return p.develop(job.film, dL) + film_places.forward(job, p, records, L)
+    return p.develop(job.film, dL) + film_places.forward(job, known, records, L)
 
 
 def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -223,6 +226,7 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
     if dr.width(lane) == 0:
         return
     δL = dr.gather(mi.Spectrum, share * p.adjoint(job.film, grad_in), lane)
+    p = p if job.film_flow is None else p.of(lane)
     λ_o, λ_d, L = backward_sweep(records, δL, flow_of(job), job.motion)
     if job.facts.view_moves:
         λ_d = λ_d + _skipped(job, p, records) * λ_o

@@ -14,7 +14,11 @@ paths' radiance next to moving places (`interior/film_places.py`), and all bound
 sensor: none of them knows this form.
 
 w is bilinear between the corners of pixels, where it is the velocity on the film of the surface that is seen: linear in
-all parameters, with weights that are detached. What else it could be would change noise alone.
+all parameters, with weights that are detached. What else it could be would change noise alone, and that is worst at
+outlines: by 1/cosθ times the motion of its surface relative to w a vertex slides along its ray, and the second moment
+of that diverges (`interior/sphere_rims.py`). So w goes on beyond an outline as it is in front of it, for a pixel:
+corners next to something nearer move as that does (`_in_front`), or rest where it rests. Balls and other smooth meshes
+that move before a plane had 5 to 10 times less noise by that, and steps at outlines nearly none.
 """
 
 from __future__ import annotations
@@ -30,9 +34,13 @@ from ..core.ad import accumulate, tangents
 from ..core.camera_rays import RayNumbers, RayPerPixel, film_position, ray_per_pixel
 from ..core.film import sampled_window
 from ..core.records import Hit
+from ..core.surface_code import top_level_of
 from ..core.varying import varying
 from ..paths.walk import first_hit
 from .motion import Displacements, Motion
+
+#: Distance of a surface in front of another part of the same shape, relative to that one's.
+CLEARLY = 0.9
 
 
 @dataclass(frozen=True)
@@ -44,14 +52,19 @@ class FilmFlow:
     corner: mi.Point2f  # of the sampled window [px]
     columns: mi.UInt32  # of corners of pixels
     last: mi.Point2f  # number of the last pixel in a row, and of the last row
-    hit: Hit  # what is seen at the corners
+    hit: Hit  # what corners move with: what is seen there, or next to them if that is nearer
+    follows: mi.Bool  # by corner: may it move?
     film: mi.Point2f  # where they are, in [0, 1]² of the crop window
     across: tuple[mi.Vector3f, mi.Vector3f]  # ṗ = across · v, of a surface that moves by v; 0 where none is followed
     nodes: mi.Vector2f  # displacement of the corners, attached, of value 0 [px]
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor, film: mi.Film, motion: Motion) -> FilmFlow:
-        """With corners that have no tangents yet, see `take_tangents`."""
+    def of(
+        scene: mi.Scene, sensor: mi.Sensor, film: mi.Film, motion: Motion, moving: mi.UInt32 | None
+    ) -> FilmFlow:
+        """With corners that have no tangents yet, see `take_tangents`. `moving`: by registry index, 1 if a shape moves
+        on the film; None: whatever is seen does.
+        """
         lower, upper = sampled_window(film)
         columns, rows = (int(n) + 1 for n in upper - lower)
         corner, width = varying(mi.Point2f, [float(x) for x in lower]), varying(mi.UInt32, columns)
@@ -62,15 +75,17 @@ class FilmFlow:
             at = film_position(sensor, place + corner)
             ray, _ = sensor.sample_ray(0, 0.5, at, mi.Point2f(0.5))
             _, pi, _ = first_hit(scene, ray, hide_emitters=False)
-            inside = (place.x > 0) & (place.y > 0) & (place.x <= last.x) & (place.y <= last.y) & pi.is_valid()
+            hit = _in_front(Hit.of(ray, pi), k, columns, rows)
+            follows = (place.x > 0) & (place.y > 0) & (place.x <= last.x) & (place.y <= last.y) & (hit.shape != 0)
+            if moving is not None:
+                follows &= dr.gather(mi.UInt32, moving, top_level_of(hit.shape), follows) != 0
             per_px = ray_per_pixel(sensor, place + corner, _through(mi.Point2f(0.5)))
-            across = _across(per_px, ray, dr.select(inside, pi.t, 1), inside)
-            hit = Hit.of(ray, pi)
-            dr.eval(hit, at, across)
+            across = _across(per_px, ray, dr.select(follows, hit.t, 1), follows)
+            dr.eval(hit, at, across, follows)
         nodes = dr.zeros(mi.Vector2f, columns * rows)
         with dr.resume_grad():
             dr.enable_grad(nodes)
-        return FilmFlow(sensor, motion, corner, width, last, hit, at, across, nodes)
+        return FilmFlow(sensor, motion, corner, width, last, hit, follows, at, across, nodes)
 
     def _displacement(self, moving: Displacements) -> mi.Vector3f:
         """Of the surfaces at the corners relative to the camera rays there, attached."""
@@ -93,22 +108,56 @@ class FilmFlow:
         with self.motion.attached() as moving:
             accumulate(dr.dot(λ, self._displacement(moving)))
 
-    def at(self, p: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
-        """Displacement of the film position `p` [px] and its divergence, attached, of value 0."""
+    def _pixel(self, p: mi.Point2f) -> tuple[mi.Point2f, tuple[mi.UInt32, ...]]:
+        """Where in its pixel the film position `p` [px] is, and the corners of that: two above, two below."""
         q = dr.detach(p) - self.corner
         pixel = dr.clip(dr.floor(q), 0, self.last)
-        s, k = q - pixel, mi.UInt32(pixel.y) * self.columns + mi.UInt32(pixel.x)
-        upper = dr.gather(mi.Vector2f, self.nodes, k), dr.gather(mi.Vector2f, self.nodes, k + 1)
-        k += self.columns
-        lower = dr.gather(mi.Vector2f, self.nodes, k), dr.gather(mi.Vector2f, self.nodes, k + 1)
-        left, right = (dr.lerp(upper[i], lower[i], s.y) for i in (0, 1))
-        above, below = (dr.lerp(row[0], row[1], s.x) for row in (upper, lower))
+        above = mi.UInt32(pixel.y) * self.columns + mi.UInt32(pixel.x)
+        below = above + self.columns
+        return q - pixel, (above, above + 1, below, below + 1)
+
+    def may_move(self, p: mi.Point2f) -> mi.Bool:
+        """May the film position `p` [px] move?"""
+        _, corners = self._pixel(p)
+        found = mi.Bool(False)
+        for k in corners:
+            found |= dr.gather(mi.Bool, self.follows, k)
+        return found
+
+    def at(self, p: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
+        """Displacement of the film position `p` [px] and its divergence, attached, of value 0."""
+        s, corners = self._pixel(p)
+        a, b, c, d = (dr.gather(mi.Vector2f, self.nodes, k) for k in corners)
+        left, right = dr.lerp(a, c, s.y), dr.lerp(b, d, s.y)
+        above, below = dr.lerp(a, b, s.x), dr.lerp(c, d, s.x)
         return mi.Vector2f(dr.lerp(left, right, s.x)), (right.x - left.x) + (below.y - above.y)
 
 
 def _through(aperture: mi.Point2f) -> RayNumbers:
     """Of a ray whose time and wavelength do not matter."""
     return RayNumbers(aperture, mi.Float(0), mi.Float(0.5))
+
+
+def _in_front(hit: Hit, k: mi.UInt32, columns: int, rows: int) -> Hit:
+    """By corner `k` of pixels, in rows of `columns`: the nearest of the hits there and at the eight corners around.
+
+    On one and the same shape only what is clearly nearer counts: elsewhere it is the same surface, seen at a slant.
+    """
+    width = varying(mi.UInt32, columns)
+    x, y = mi.Int32(k % width), mi.Int32(k // width)
+    x_end, y_end = varying(mi.Int32, columns), varying(mi.Int32, rows)
+    dr.eval(hit)
+    nearest, t = mi.UInt32(k), dr.select(hit.shape != 0, hit.t, dr.inf)
+    own = mi.Float(t)
+    for dx, dy in ((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy):
+        there = (x + dx >= 0) & (x + dx < x_end) & (y + dy >= 0) & (y + dy < y_end)
+        other = mi.UInt32((y + dy) * x_end + x + dx)
+        shape = dr.gather(mi.UInt32, hit.shape, other, there)
+        t_other = dr.gather(mi.Float, hit.t, other, there)
+        farthest = dr.select(shape == hit.shape, CLEARLY * own, own)
+        nearer = there & (shape != 0) & (t_other < dr.minimum(t, farthest))
+        nearest, t = dr.select(nearer, other, nearest), dr.select(nearer, t_other, t)
+    return dr.gather(Hit, hit, nearest)
 
 
 def _across(

@@ -10,14 +10,17 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..core.sensor_frame import KINDS
-from ..options import FOLLOWING, MATERIAL, SPATIAL, Options
+from ..options import FILM, FOLLOWING, MATERIAL, SPATIAL, Options, of_vertices
 from ..scene.capabilities import WITHOUT_MATERIAL
-from ..scene.facts import SceneFacts
+from ..scene.facts import SceneFacts, ShapeFacts
 from .call import Call
 from .plan import Geometry
 
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
 CONTACT = 0.02
+
+#: Faces from which a mesh may be round.
+MANY_FACES = 100
 
 #: The reason for the first form where a pilot would choose, but has nothing to go by.
 NOTHING_TO_COMPARE = "there is no noise to compare the forms by"
@@ -30,22 +33,36 @@ def forms_to_try(
 
     `film_rests`: see `why_film_rests`.
     """
-    if facts.geometry_moves and facts.has_delta_lobes:
-        return (SPATIAL,), "directions follow mirrors and glass"
-    # points of a B-spline are followed, but not as its texture coordinates turn about its axis
-    unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL or (s.kind == "curve" and s.patterns)]
-    if facts.geometry_moves and unmapped:
-        return (SPATIAL,), f"the points of '{unmapped[0]}' are not followed"
     if options.form in FOLLOWING and film_rests:
         return (SPATIAL,), film_rests
+    confined = _why_vertices_slide(facts)
     if options.form != "auto":
-        return (options.form,), "as asked for"
-    forms, reason = _of_vertices(scene, facts, options, geometry)
+        if of_vertices(options.form) == SPATIAL or not confined:
+            return (options.form,), "as asked for"
+        return (FILM if options.form in FOLLOWING else SPATIAL,), confined
+    forms, reason = ((SPATIAL,), confined) if confined else _of_vertices(scene, facts, options, geometry)
     followed = (shape for shape in facts.shapes if facts.camera_moves or shape.moves)
-    if film_rests or not any(shape.painted for shape in followed):  # else it has more noise, not less
+    if film_rests or not any(_uneven(shape) for shape in followed):  # else it has more noise, not less
         return forms, reason
     following = {vertices: form for form, vertices in FOLLOWING.items()}
     return (*forms, following[forms[-1]]), NOTHING_TO_COMPARE
+
+
+def _why_vertices_slide(facts: SceneFacts) -> str:
+    """Why vertices cannot stay on their material points, "" if they can."""
+    if not facts.geometry_moves:
+        return ""
+    if facts.has_delta_lobes:
+        return "directions follow mirrors and glass"
+    # points of a B-spline are followed, but not as its texture coordinates turn about its axis
+    unmapped = [s.name for s in facts.shapes if s.plugin in WITHOUT_MATERIAL or (s.kind == "curve" and s.patterns)]
+    return f"the points of '{unmapped[0]}' are not followed" if unmapped else ""
+
+
+def _uneven(shape: ShapeFacts) -> bool:
+    """Does what a pixel sees of it change as it moves: by a texture, or by where its surface turns from the viewer?"""
+    flat = shape.plugin in ("rectangle", "disk") or (shape.kind == "mesh" and shape.faces < MANY_FACES)
+    return shape.painted or shape.smooth or not flat
 
 
 def why_film_rests(call: Call, facts: SceneFacts) -> str:
@@ -58,8 +75,6 @@ def why_film_rests(call: Call, facts: SceneFacts) -> str:
         return "a box filter has no slope along which places on the film could move"
     if call.options.light_paths != "off":
         return "light subpaths end at places on the film that rest"
-    if facts.has_delta_lobes:
-        return "lines across the film, along which mirrors and glass are looked at, rest"
     return ""
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..edges.scene_table import scene_edges
 from ..edges.table import EdgeTable
 from ..plan.job import Job
-from .rows import ROW_SAMPLER, SampledRows, row_state
+from .rows import ROW_SAMPLER, SampledRows, row_state, with_static_share
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,17 @@ class FilmEdges(SampledRows):
 
 
 def film_weights(job: Job) -> list[mi.Float]:
-    """By kind of edge, the weight of each row: of moving shapes, or of all if camera rays move."""
+    """By kind of edge, the weight of each row: of moving shapes, or of all if camera rays move.
+
+    Rays from film positions that follow shapes move but where those are seen.
+    """
     table = scene_edges(job)
     border = job.film.rfilter().border_size() if job.film.sample_border() else 0
     weights = table.weights(lambda kind: kind.film_weights(job.frame, border))
-    if job.facts.view_moves or not job.plan.prunes:
+    if job.facts.camera_moves or not job.plan.prunes:
         return weights
+    if job.facts.places_move:
+        return with_static_share(weights, table.moving())
     return [dr.select(moves, w, 0) for w, moves in zip(weights, table.moving(), strict=True)]
 
 

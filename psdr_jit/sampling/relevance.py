@@ -28,10 +28,7 @@ from ..plan.job import Job
 from .directions import pdf_view, sample_view
 from .mirror_images import SeenBall, SeenBalls, with_images
 from .nearness import nearness
-from .rows import ROW_SAMPLER, SampledRows, row_state
-
-#: Share of the samples on edges of resting shapes while only shapes move.
-STATIC_SHARE = 0.25
+from .rows import ROW_SAMPLER, SampledRows, row_state, with_static_share
 
 #: Relevance of a resting edge that no moving shape sees directly, only by way of other surfaces.
 INDIRECT_RELEVANCE = 0.05
@@ -62,8 +59,8 @@ class Movers:
         return self.seen.seen_from(x)
 
 
-#: Of one render call: what moves, by what lines through edges are drawn for and whether camera rays move.
-MOVERS: Slot[dict[tuple[Use, bool], Movers | None]] = Slot(dict)
+#: Of one render call: what moves, by what lines through edges are drawn for.
+MOVERS: Slot[dict[Use, Movers | None]] = Slot(dict)
 
 
 @dataclass(frozen=True)
@@ -138,19 +135,20 @@ def line_weights(job: Job, use: Use) -> list[mi.Float]:
 def movers_of(job: Job, use: Use) -> Movers | None:
     """What moves, if only some shapes do; found once per render call.
 
-    None if every edge moves relative to something (shadows with a light, all behind glass), or if no shape moves.
+    None if every edge moves relative to something (all with the camera, shadows with a light, all behind glass), or
+    if no shape moves. Places on the film that follow shapes hardly move anywhere else.
     """
-    known, which = job.shared[MOVERS], (use, job.facts.view_moves)
-    if which not in known:
-        known[which] = _found_movers(job, use)
-    return known[which]
+    known = job.shared[MOVERS]
+    if use not in known:
+        known[use] = _found_movers(job, use)
+    return known[use]
 
 
 def _found_movers(job: Job, use: Use) -> Movers | None:
     facts = job.facts
     light_moves = facts.emitters_move or any(s.moves and s.is_emitter for s in facts.shapes)
     moving = [s for s in facts.shapes if s.index >= 0 and s.moves]
-    everywhere = facts.view_moves or facts.paths_bend or (use is Use.SHADOW and light_moves)
+    everywhere = facts.camera_moves or facts.paths_bend or (use is Use.SHADOW and light_moves)
     if everywhere or not moving or not job.plan.prunes:
         return None
     shapes = job.scene.shapes()
@@ -162,13 +160,8 @@ def _found_movers(job: Job, use: Use) -> Movers | None:
 
 def _balanced(weights: list, moving: list, seen: list) -> list:
     """Resting edges weighed by what they see of the movers (share of all directions), and scaled to their share."""
-    weights = [w * dr.select(m, 1, s + INDIRECT_RELEVANCE) for w, m, s in zip(weights, moving, seen, strict=True)]
-    static_sum = sum(dr.sum(dr.select(m, 0, w)) for w, m in zip(weights, moving, strict=True))
-    moving_sum = sum(dr.sum(dr.select(m, w, 0)) for w, m in zip(weights, moving, strict=True))
-    both = (static_sum > 0) & (moving_sum > 0)
-    scale = dr.select(both, STATIC_SHARE / (1 - STATIC_SHARE) * moving_sum / static_sum, 1)
-    dr.make_opaque(scale)
-    return [w * dr.select(m, 1, scale) for w, m in zip(weights, moving, strict=True)]
+    seen = [dr.select(m, 1, s + INDIRECT_RELEVANCE) for m, s in zip(moving, seen, strict=True)]
+    return with_static_share([w * s for w, s in zip(weights, seen, strict=True)], moving)
 
 
 def light_bounds(job: Job) -> list[LightBounds] | None:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
 import mitsuba as mi
 
 from ..core.joining import joined
@@ -22,6 +23,9 @@ from ..core.varying import varying
 from ..edges.location import EdgeLocation
 from ..plan.job import Job
 from .distribution import EdgeDistribution, edge_distribution, pmf, sample_edge, stratified
+
+#: Share of the samples on edges of resting shapes while only shapes move.
+STATIC_SHARE = 0.25
 
 
 class RowSampler(ABC):
@@ -118,3 +122,13 @@ def edge_samples(job: Job, paths: int) -> int:
     """Number of edge samples for a term's budget, which counts paths: one edge sample takes `paths` of them."""
     width, height = job.frame.crop_size
     return max(1, job.spp * width * height // paths)
+
+
+def with_static_share(weights: list[mi.Float], moving: list[mi.Bool]) -> list[mi.Float]:
+    """Weights of rows, by kind, with those of resting edges scaled to `STATIC_SHARE` of all, if there are both."""
+    static_sum = sum(dr.sum(dr.select(m, 0, w)) for w, m in zip(weights, moving, strict=True))
+    moving_sum = sum(dr.sum(dr.select(m, w, 0)) for w, m in zip(weights, moving, strict=True))
+    both = (static_sum > 0) & (moving_sum > 0)
+    scale = dr.select(both, STATIC_SHARE / (1 - STATIC_SHARE) * moving_sum / static_sum, 1)
+    dr.make_opaque(scale)
+    return [w * dr.select(m, 1, scale) for w, m in zip(weights, moving, strict=True)]

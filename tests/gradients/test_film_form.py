@@ -34,9 +34,21 @@ CASES = {  # scene, parameter, motion
     "box": ("lit_box", "box.vertex_positions", {"direction": (0.3, 0.2, 0.1)}),  # before a camera at rest
     "ball": ("ball_shadow", "blocker.to_world", {"direction": (0.3, 0.2, 0.1)}),
     "light": ("disk_rim", "disk.to_world", {"rotate": (0.48, 0.6, 0.64)}),  # that is seen alone: else nothing changes
+    "mirrored": ("mirrors", "blocker.vertex_positions", {"direction": (0.3, 0.2, 0.1)}),  # and seen there
+    "mirror": ("mirrors", "mirror.to_world", {"rotate": (0.48, 0.6, 0.64)}),
+    "glass": ("glass", "body.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "glass-view": ("glass", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "window": ("window", "pane.to_world", {"rotate": (0.48, 0.6, 0.64)}),
+    "mask": ("mask_shadow", "sheet.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "grid": ("grid_shadow", "blocker.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "gaussians": ("ellipsoids_shadow", "camera.to_world", {"direction": (0.3, 0.2, 0.1)}),
+    "rod": ("rod_shadow", "blocker.control_points", {"direction": (0.3, 0.2, 0.1)}),
+    "spline": ("painted_curves", "spline.control_points", {"direction": (0.3, 0.2, 0.1)}),
     "away": ("baffled_light", "blocker.vertex_positions", {"rotate": (0.48, 0.6, 0.64)}),
 }
 FAST = ("moved", "light")
+SLIDING = {"mirrored", "mirror", "glass", "glass-view", "window", "mask", "grid", "gaussians", "rod", "spline"}
+KNOWN_TO = dict.fromkeys(("mirror", "window", "away", "glass"), 0.1)  # of gains: heavy tails of the spatial form
 EACH = [case if case in FAST else also(case) for case in CASES]
 
 
@@ -62,6 +74,7 @@ def picture(pixel_format: str = "luminance", rfilter: str = "gaussian", wall: st
 
 
 CARD, CAMERA = "card.to_world", "camera.to_world"
+BALL = ("smooth_mesh", "ball.vertex_positions")
 
 
 def picture_moves(param: str = CAMERA, **how) -> Perturbation:
@@ -76,11 +89,12 @@ def plan_of(scene: mi.Scene, param: str, kind: str = "psdr_path", **options):
 def test_it_is_the_same_derivative(llvm, case):
     motion = motion_of(case)
     ours = forward(motion, spec_of(motion.scene, **FILM), SEEDS, SPP)
-    assert_grad_close(ours, forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP))
+    theirs = forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP)
+    assert_grad_close(ours, theirs, **({"max_stderr": KNOWN_TO[case]} if case in KNOWN_TO else {}))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case != "smooth"])
+@pytest.mark.parametrize("case", [case for case in CASES if case not in {"smooth", *SLIDING}])
 def test_it_is_the_same_where_vertices_keep_to_their_surfaces(llvm, case):
     motion = motion_of(case)
     ours = forward(motion, spec_of(motion.scene, **FILM_MATERIAL), SEEDS, SPP)
@@ -93,7 +107,7 @@ def test_forward_and_backward_are_transposes(llvm, case, form):
     motion = motion_of(case)
     integrator = integrator_specs.build(spec_of(motion.scene, **form))
     wJv, JTwv, w, Jv = adjoint_identity(motion.scene, CASES[case][1], integrator)
-    assert integrator.plan.form == form["form"] and Jv > 0
+    assert integrator.plan.form == ("film" if case in SLIDING else form["form"]) and Jv > 0
     assert abs(wJv - JTwv) <= 1e-5 * w * Jv
 
 
@@ -136,6 +150,17 @@ def test_fine_pictures_are_less_noisy(llvm, param):
 
 def test_it_is_chosen_before_fine_pictures(llvm):
     plan = plan_of(picture(), CAMERA)
+    assert plan.form == "film" and "than spatial, by a pilot" in plan.form_reason
+
+
+def test_it_is_chosen_for_what_is_round(llvm):
+    """At outlines the spatial form has no finite variance, or nearly none: vertices slide by 1/cosθ there."""
+    motion = perturb(load(Problem(*BALL, 0.0), res=RES, rfilter="gaussian"), BALL[1], (0.3, 0.2, 0.1))
+    spec = {"type": "psdr_path", "max_depth": 2}
+    auto, spatial = (forward(motion, {**spec, **form}, SEEDS, SPP) for form in ({}, SPATIAL))
+    assert 4 * auto.var(0, ddof=1).mean() < spatial.var(0, ddof=1).mean()
+    assert_grad_close(auto, spatial)
+    plan = plan_of(motion.scene, BALL[1])
     assert plan.form == "film" and "than spatial, by a pilot" in plan.form_reason
 
 
@@ -187,7 +212,7 @@ def test_where_places_on_the_film_rest(llvm):
 def test_a_given_plan_is_one_of_its_film(llvm):
     scene, box, mirror = picture(), picture(rfilter="box"), picture(wall="conductor")
     text = plan_of(scene, CAMERA, **FILM).to_json()
-    for there, match in ((scene, None), (box, "box filter"), (mirror, "mirrors and glass")):
+    for there, match in ((scene, None), (box, "box filter"), (mirror, "leaves out chain")):
         motion = perturb(there, CAMERA, (1, 0, 0))
         motion.attach()
         integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "plan": text})

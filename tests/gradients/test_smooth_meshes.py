@@ -204,5 +204,6 @@ def test_coarse_mirrors_under_a_sky_are_right(llvm, bsdf, named):
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        make_plan(scene, "shape.vertex_positions", integrator={"type": "psdr_path", "max_depth": 3, "sppc": 1})
+        make_plan(scene, "shape.vertex_positions",
+                  integrator={"type": "psdr_path", "max_depth": 3, "form": "spatial", "sppc": 1})  # fmt: skip
     assert any("degrees off" in str(w.message) for w in caught) == named

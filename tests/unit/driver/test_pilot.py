@@ -146,9 +146,11 @@ def test_the_probe_is_the_derivative_along_its_motion(llvm, form, scene_name, pa
 
 FORMS = {  # (scene, parameter, depth): forms that come into question
     ("cbox", BOX, 4): ("spatial",),  # next to the large box
-    ("baffled_light", "blocker.vertex_positions", 4): ("spatial", "material"),
-    ("baffled_light", "blocker.vertex_positions", 2): ("spatial",),
-    ("baffled_light", "camera.to_world", 4): ("spatial", "material"),
+    ("area_shadow", "blocker.vertex_positions", 4): ("spatial", "material"),
+    ("area_shadow", "blocker.vertex_positions", 2): ("spatial",),
+    ("area_shadow", "camera.to_world", 4): ("spatial", "material"),
+    ("baffled_light", "blocker.vertex_positions", 4): ("spatial", "material", "film-material"),  # it has many faces
+    ("baffled_light", "blocker.vertex_positions", 2): ("spatial", "film"),
     ("cbox", "white.reflectance.value", 4): ("spatial",),
 }
 
