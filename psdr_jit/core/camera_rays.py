@@ -75,15 +75,16 @@ def rays_at(sensor: mi.Sensor, p: mi.Point2f, numbers: RayNumbers) -> tuple[mi.R
 
 def camera_rays(
     sensor: mi.Sensor, samples: FilmSamples, rng: LaneSampler, lane: mi.UInt32
-) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, RayNumbers]:
-    """`(rays, weights, film positions [px], what else is random)` of the samples `lane`; attached to the sensor.
+) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, mi.Point2f, RayNumbers]:
+    """`(rays, weights, film positions, the same for the film, what else is random)` of the samples `lane`; attached to
+    the sensor. Positions are in pixels.
 
-    The positions are those that `film.develop_samples` wants: with a box filter the corner of the pixel, as a sum
-    rounded up would be in the next one. Random numbers are used in the order of `ADIntegrator.sample_rays`.
+    `film.develop_samples` wants them with a box filter in the corner of the pixel, as a sum rounded up would be in the
+    next one. Random numbers are used in the order of `ADIntegrator.sample_rays`.
     """
     pixel, _ = samples.place(lane)
     corner = samples.corner_of(pixel)
     p = corner + rng.next_2d()
     numbers = RayNumbers.draw(sensor, rng)
     ray, weight = rays_at(sensor, p, numbers)
-    return ray, weight, corner if sensor.film().rfilter().is_box_filter() else p, numbers
+    return ray, weight, p, corner if sensor.film().rfilter().is_box_filter() else p, numbers

@@ -39,6 +39,7 @@ class Stream(IntEnum):
     SPHERE_RIM_PATHS = 23
     LIGHT_HORIZON = 24
     LIGHT_HORIZON_SUBPATH = 25
+    FILM_BORDER = 26
 
 
 def other_seed(seed: int | mi.UInt32, key: int) -> mi.UInt32:

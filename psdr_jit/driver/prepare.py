@@ -21,7 +21,7 @@ from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
 from ..options import FOLLOWING, MATERIAL, SPATIAL, Options, of_vertices, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
-from ..plan.form_choice import forms_to_try, why_film_rests
+from ..plan.form_choice import forms_to_try, why_film_is_not_tried, why_film_rests
 from ..plan.job import Job
 from ..plan.light_plan import plan_light
 from ..plan.plan import NO_EDGES, SWITCHED_OFF, Geometry, Plan, TermPlan
@@ -183,7 +183,7 @@ def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     call, budgets = q.call, q.budgets
     geometry = _geometry(q, call.options.plan == "lean")
-    film_rests = why_film_rests(call, q.facts)
+    film_rests = why_film_rests(call, q.facts) or why_film_is_not_tried(call)
     forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, film_rests)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:

@@ -33,6 +33,7 @@ class CameraPass:
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
     at: films.FilmPoints
+    p: mi.Point2f  # where rays begin on the film, if that moves [px]
     per_px: RayPerPixel | None  # where film positions move
 
     sought = False  # which of them meet what moves is not known
@@ -53,7 +54,8 @@ class CameraPass:
         at = films.FilmPoints(dr.gather(mi.Point2f, self.at.p, lane), dr.gather(mi.Float, self.at.weight, lane), False)
         ray, weight = dr.gather(type(self.ray), self.ray, lane), dr.gather(mi.Spectrum, self.weight, lane)
         per_px = None if self.per_px is None else dr.gather(type(self.per_px), self.per_px, lane)
-        return replace(self, ray=ray, weight=weight, at=at, per_px=per_px)
+        p = dr.gather(mi.Point2f, self.p, lane)
+        return replace(self, ray=ray, weight=weight, at=at, p=p, per_px=per_px)
 
     def develop(self, film: mi.Film, value: mi.Spectrum) -> mi.TensorXf:
         """Image of what the samples bring."""
@@ -76,9 +78,9 @@ def camera_passes(job: Job) -> Iterator[CameraPass]:
         samples = FilmSamples.over(film, part.spp, part.density)
         lane = dr.arange(mi.UInt32, samples.count)
         rng = samples.sampler(stream_seed(part.seed, Stream.CAMERA), lane)
-        ray, weight, p, numbers = camera_rays(job.sensor, samples, rng, lane)
+        ray, weight, p, place, numbers = camera_rays(job.sensor, samples, rng, lane)
         per_px = None if job.film_flow is None else ray_per_pixel(job.sensor, p, numbers)
-        at = films.FilmPoints(p, samples.weight(), part.spp >= COALESCED)
+        at = films.FilmPoints(place, samples.weight(), part.spp >= COALESCED)
         # at once: films are written and read after paths are traced
-        dr.eval(dr.detach(ray), weight, p, at.weight, per_px)
-        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at, per_px)
+        dr.eval(dr.detach(ray), weight, place, at.weight, per_px, *([] if per_px is None else [p]))
+        yield CameraPass(samples, share, stream_seed(part.seed, Stream.INTERIOR), ray, weight, at, p, per_px)

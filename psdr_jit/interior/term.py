@@ -28,7 +28,7 @@ from ..plan.reasons import what_changes
 from ..plan.term import Term, Verdict
 from ..scene.facts import SceneFacts
 from ..scene.registry import registry_table
-from . import film_places, light_traced
+from . import film_borders, film_places, light_traced
 from .along_walk import MaterialTangents, RadianceTangents
 from .camera_pass import CameraPass, camera_passes
 from .flow import Flow, SceneTraits
@@ -108,7 +108,7 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
         sampler = p.sampler(lane)
         found = touches(job.scene, sampler, ray, limits, job.options.hide_emitters, touch_table(job))
         if job.film_flow is not None:
-            found |= job.film_flow.may_move(p.at.p)
+            found |= job.film_flow.may_move(p.p)
         lane = dr.compress(found)
         job.call.memory[TOUCHED_SHARE] = dr.width(lane) / dr.width(found)
         if dr.width(lane) == 0:
@@ -200,6 +200,8 @@ def forward(job: Job) -> mi.TensorXf:
             found = _from_light(job, p)
             if found is not None:
                 image += p.share * light_traced.forward(job, found, flow_of(job))
+        if film_borders.matter(job):
+            image += film_borders.forward(job)
     return image
 
 
@@ -218,6 +220,8 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                 light_traced.backward(job, found, flow_of(job), p.share * grad_in)
             for part in with_rims(rims, p):
                 _accumulate_adjoint(job, part, p.share, grad_in)
+        if film_borders.matter(job):
+            film_borders.backward(job, grad_in)
 
 
 def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in: mi.TensorXf) -> None:
@@ -259,7 +263,8 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 TERM = Term(
     name="interior",
     budget="sppc",
-    streams=(Stream.CAMERA, Stream.INTERIOR, Stream.LIGHT_SUBPATH, Stream.SPHERE_RIMS, Stream.SPHERE_RIM_PATHS),
+    streams=(Stream.CAMERA, Stream.INTERIOR, Stream.LIGHT_SUBPATH, Stream.SPHERE_RIMS, Stream.SPHERE_RIM_PATHS,
+             Stream.FILM_BORDER),
     needed=needed,
     cost=lambda form, sky: 1.0,
     with_light=3.0,  # 2.5 to 5.6 by processor time: a spot moved, glass moved, an index, 64² and 16²

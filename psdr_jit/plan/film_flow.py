@@ -10,8 +10,8 @@ what paths bring and v the velocity of an outline across the film, Reynolds' tra
 for any w that is continuous and 0 around the film, as in the reparameterisation of [Bangaru et al. 2020, §4], where
 however w has to agree with v so that the last integral vanishes. Here that one is sampled as ever, and the closer w is
 to v the less there is of it. The first integral is the interior term of camera rays that turn by w, the second the same
-paths' radiance next to moving places (`interior/film_places.py`), and all boundary terms see w as a motion of the
-sensor: none of them knows this form.
+paths' radiance next to moving places (`interior/film_places.py`), of a box filter across borders of pixels
+(`interior/film_borders.py`), and all boundary terms see w as a motion of the sensor: none of them knows this form.
 
 w is bilinear between the corners of pixels, where it is the velocity on the film of the surface that is seen: linear in
 all parameters, with weights that are detached. What else it could be would change noise alone, and that is worst at

@@ -71,10 +71,15 @@ def why_film_rests(call: Call, facts: SceneFacts) -> str:
         return "camera and shapes rest, and so do places on the film"
     if call.sensor.class_name() not in KINDS:
         return f"places on the film of a '{call.sensor.class_name()}' are not followed"
-    if call.film.rfilter().is_box_filter():
-        return "a box filter has no slope along which places on the film could move"
     if call.options.light_paths != "off":
         return "light subpaths end at places on the film that rest"
+    return ""
+
+
+def why_film_is_not_tried(call: Call) -> str:
+    """Why a pilot does not weigh forms in which film positions follow what is seen, unless they are asked for."""
+    if call.options.form == "auto" and call.film.rfilter().is_box_filter():
+        return "what crosses the borders of pixels takes paths of its own"
     return ""
 
 

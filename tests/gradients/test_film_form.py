@@ -15,7 +15,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import Perturbation, perturb
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.errors import OptionError
-from psdr_jit.interior import film_places
+from psdr_jit.interior import film_borders, film_places
 
 RES, SPP, SEEDS, STEP = 16, 64, 24, 0.01
 TEXELS = 48  # a side, of the fine picture
@@ -52,10 +52,10 @@ KNOWN_TO = dict.fromkeys(("mirror", "window", "away", "glass"), 0.1)  # of gains
 EACH = [case if case in FAST else also(case) for case in CASES]
 
 
-def motion_of(case: str, **defaults) -> Perturbation:
+def motion_of(case: str, rfilter: str = "gaussian") -> Perturbation:
     name, param, how = CASES[case]
     size = {} if case == "crop" else {"res": RES}
-    return perturb(load(Problem(name, param, 0.0), rfilter="gaussian", **size, **defaults), param, **how)
+    return perturb(load(Problem(name, param, 0.0), rfilter=rfilter, **size), param, **how)
 
 
 def picture(pixel_format: str = "luminance", rfilter: str = "gaussian", wall: str = "diffuse") -> mi.Scene:
@@ -91,6 +91,33 @@ def test_it_is_the_same_derivative(llvm, case):
     ours = forward(motion, spec_of(motion.scene, **FILM), SEEDS, SPP)
     theirs = forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP)
     assert_grad_close(ours, theirs, **({"max_stderr": KNOWN_TO[case]} if case in KNOWN_TO else {}))
+
+
+@pytest.mark.parametrize("case", EACH)
+def test_it_is_the_same_under_a_box_filter(llvm, case):
+    """Whose pixels see what moves by what crosses their borders."""
+    motion = motion_of(case, rfilter="box")
+    ours = forward(motion, spec_of(motion.scene, **FILM), SEEDS, SPP)
+    theirs = forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP)
+    assert_grad_close(ours, theirs, **({"max_stderr": KNOWN_TO[case]} if case in KNOWN_TO else {}))
+
+
+@pytest.mark.parametrize("case", EACH)
+def test_both_modes_know_what_crosses_borders(llvm, case):
+    motion = motion_of(case, rfilter="box")
+    integrator = integrator_specs.build(spec_of(motion.scene, **FILM))
+    wJv, JTwv, w, Jv = adjoint_identity(motion.scene, CASES[case][1], integrator)
+    assert integrator.plan.form == "film" and Jv > 0 and abs(wJv - JTwv) <= 1e-5 * w * Jv
+
+
+@pytest.mark.slow
+def test_what_crosses_borders_could_have_been_missing(llvm, monkeypatch):
+    motion = motion_of("moved", rfilter="box")
+    spec = spec_of(motion.scene, **FILM)
+    whole = forward(motion, spec, SEEDS, SPP)
+    monkeypatch.setattr(film_borders, "forward", lambda job: mi.TensorXf(0.0))
+    with pytest.raises(AssertionError, match="gain"):
+        assert_grad_close(forward(motion, spec, SEEDS, SPP), whole, max_stderr=1.0)
 
 
 @pytest.mark.slow
@@ -198,9 +225,10 @@ def test_where_places_on_the_film_rest(llvm):
     """The plan says why; where nothing is painted the form is not tried."""
     scene = picture()
     assert plan_of(scene, CAMERA, **FILM).form == "film"
+    boxes = picture(rfilter="box")
+    assert plan_of(boxes, CAMERA, **FILM).form == "film" and "film" not in plan_of(boxes, CAMERA).form_reason
     for plan, why in (
         (plan_of(scene, "lamp.position", **FILM), "camera and shapes rest"),
-        (plan_of(picture(rfilter="box"), CAMERA, **FILM), "box filter"),
         (plan_of(scene, CAMERA, "psdr_bdpt", **FILM), "light subpaths"),
     ):
         assert plan.form == "spatial" and why in plan.form_reason
@@ -212,7 +240,7 @@ def test_where_places_on_the_film_rest(llvm):
 def test_a_given_plan_is_one_of_its_film(llvm):
     scene, box, mirror = picture(), picture(rfilter="box"), picture(wall="conductor")
     text = plan_of(scene, CAMERA, **FILM).to_json()
-    for there, match in ((scene, None), (box, "box filter"), (mirror, "leaves out chain")):
+    for there, match in ((scene, None), (box, None), (mirror, "leaves out chain")):
         motion = perturb(there, CAMERA, (1, 0, 0))
         motion.attach()
         integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "plan": text})
