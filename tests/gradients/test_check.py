@@ -145,7 +145,7 @@ def card():
 )
 def test_moving_card_passes(card, how):
     """Primary boundary alone; oracle: finite differences of `path`."""
-    result = check_gradient(card, "card.vertex_positions", integrator="psdr_path", max_seconds=20, **how)
+    result = check_gradient(card, "card.vertex_positions", integrator="psdr_path", max_seconds=60, **how)
     assert result.passed, str(result)
 
 
