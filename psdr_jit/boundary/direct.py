@@ -60,6 +60,7 @@ from .light_steps import BORNE
 from .light_steps import ESTIMATOR as LIGHT_STEPS
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, longest_from_light, subpaths
+from .towards_sensor import share_towards_sensor
 
 NAME = "direct"
 
@@ -168,12 +169,21 @@ def evaluate(job: Job, edges: SecondaryEdges, segment: BoundarySegment) -> Bound
     """What the segments are worth at the sensor: their subpaths are recorded."""
     a = -(1 - segment.ratio) * segment.n_perp
     value, still = segment.value / segment.pdf, mi.Vector3f(0)
+    if has_smooth_lights(job.facts):
+        value *= _beside_samples_of_light(job, segment)
     receivers = Receivers(segment.lane, segment.receiver, segment.wavelengths, value, a, still)
     records = subpaths(job, Stream.DIRECT_SUBPATH, receivers, longest_from_light(job))
     value = records.left_by_smooth_lobes(records.data.W)
     return BoundarySamples.of(
         segment, records, value, lambda moving: source_motion(job, segment, moving), segment.drawn
     )
+
+
+def _beside_samples_of_light(job: Job, segment: BoundarySegment) -> mi.Float:
+    """R/ρ of `paths.smooth_lights`: lights are sampled as by Mitsuba here, which has ρ in it."""
+    lit = segment.source.shape != 0
+    R, ρ = share_towards_sensor(job, segment.receiver, segment.source.interaction(lit), segment.ω, lit)
+    return R / ρ
 
 
 def source_motion(job: Job, segment: BoundarySegment, moving: Displacements) -> mi.Float:

@@ -25,6 +25,7 @@ from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.kind import Sight
 from ..edges.location import EdgeLocation
+from ..paths.smooth_lights import has_smooth_lights
 from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from ..sampling.horizons import SampledHorizons, sampled_horizons
@@ -33,6 +34,7 @@ from .edge_lines import EdgeView
 from .indirect_material import Background
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, longest_from_light, subpaths
+from .towards_sensor import share_towards_sensor
 
 #: Sine of the angle to its plane at which a face is met: far above rounding, far below those between its normals.
 TILT = 3e-4
@@ -172,6 +174,8 @@ def trace_lights(job: Job, horizons: SampledHorizons, line: HorizonLine) -> LitH
     finite = pi.is_valid()
     r = dr.select(finite, pi.t, on.size)
     end, cos = receiver(on)
+    if has_smooth_lights(job.facts):
+        L *= share_towards_sensor(job, end, si, on.ω, active)[0]
     lit = LitHorizon(
         lane=line.lane,
         at=EdgeLocation(line.row, line.t, on.x + r * on.ω, mi.Point3f(0), mi.Float(0)),

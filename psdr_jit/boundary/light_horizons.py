@@ -28,9 +28,7 @@ import mitsuba as mi
 
 from ..core.compaction import compact
 from ..core.records import Hit
-from ..core.sensor_frame import viewpoint
 from ..core.streams import Stream
-from ..edges.film_cover import LENS_CENTRE
 from ..edges.followed_lights import is_followed
 from ..edges.horizons import HorizonPoint
 from ..edges.location import EdgeLocation
@@ -42,6 +40,7 @@ from ..sampling.light_horizons import sampled_light_horizons
 from .horizons import HorizonLine, partner_agrees, per_length, receiver, sample_lines, sides
 from .segment_motion import BoundarySamples, SecondaryTerm
 from .sensor_subpath import Receivers, longest_from_light, subpaths
+from .towards_sensor import facing_sensor
 
 
 @dataclass
@@ -94,9 +93,7 @@ def _light(on: HorizonPoint, towards: mi.Float) -> mi.SurfaceInteraction3f:
 
 def _weighed_cosine(job: Job, ray: mi.Ray3f, pi, light: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
     """|n_s·ω| w_e, the path going on from x_D to the sensor."""
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
-    si.wi = si.to_local(dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(si.p)))
+    si = facing_sensor(job, pi.compute_surface_interaction(ray, mi.RayFlags.All, active))
     p_e = pdf_of_sample(job.scene, si, light, -ray.d, active)
     p_b = si.bsdf().pdf(mi.BSDFContext(), si, si.to_local(-ray.d), active)
     return dr.abs_dot(light.sh_frame.n, ray.d) * mis_weight(p_e, p_b)

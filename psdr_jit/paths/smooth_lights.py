@@ -48,25 +48,31 @@ class SmoothLights:
 
         As attached as `si`, `light` and the direction ω between them; 1 for other lights and where seen edge-on.
         """
-        R, ρ = self._share(si, bsdf, light, ω, active)
+        R, ρ = share(self.scene, si, bsdf, light, ω, active)
         ρ = dr.detach(ρ)
         return shared_by_sample(R, ρ, mis) if self.alone else R / ρ
 
     def of_ray(self, si, bsdf: mi.BSDFPtr, light, ω: mi.Vector3f, mis: mi.Float, active: mi.Bool) -> mi.Float:
         """The same for what a sampled direction meets."""
-        R, ρ = self._share(si, bsdf, light, ω, active)
+        R, ρ = share(self.scene, si, bsdf, light, ω, active)
         ρ2 = dr.square(dr.detach(ρ))
         return R / (mis + (1 - mis) * ρ2) if self.alone else R
 
-    def _share(self, si, bsdf: mi.BSDFPtr, light, ω: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """`(R, ρ)`, attached."""
-        n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
-        usable = active & light.is_valid() & (n_g > GRAZING_FLAT) & (n_s > GRAZING_FLAT)
-        ρ = dr.select(usable, n_s / n_g, 1)
-        e2 = dr.square(pdf_of_sample(self.scene, si, light, ω, usable))
-        b2 = dr.square(bsdf.pdf(mi.BSDFContext(), si, si.to_local(ω), usable))
-        usable &= b2 + e2 > 0
-        return dr.select(usable, (b2 + ρ * e2) / dr.select(usable, b2 + e2, 1), 1), ρ
+
+def share(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, light, ω: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """`(R, ρ)` of what `si` gets from `light` (a surface interaction) along ω and sends on towards its wi.
+
+    As attached as its arguments; 1 for other lights and where the light is seen edge-on.
+    """
+    n_s, n_g = dr.abs_dot(light.sh_frame.n, ω), dr.abs_dot(light.n, ω)
+    usable = active & light.is_valid() & (n_g > GRAZING_FLAT) & (n_s > GRAZING_FLAT)
+    ρ = dr.select(usable, n_s / n_g, 1)
+    e2 = dr.square(pdf_of_sample(scene, si, light, ω, usable))
+    b2 = dr.square(bsdf.pdf(mi.BSDFContext(), si, si.to_local(ω), usable))
+    usable &= b2 + e2 > 0
+    return dr.select(usable, (b2 + ρ * e2) / dr.select(usable, b2 + e2, 1), 1), ρ
 
 
 def shared_by_sample(R: mi.Float, ρ: mi.Float, mis: mi.Float) -> mi.Float:
