@@ -31,7 +31,7 @@ BESIDE = (1.3, 0.4, -0.7)  # a point of the axis that bodies turn about
 STEP = 0.004  # of differences: a thirtieth of a pixel, which a blurred outline hardly shows
 VERTEX_STEP = 0.008  # the same in edges of the mesh: .02 was off by half a per cent
 SEEN_EDGES = 6.0  # width of the view of a vertex that moves
-SKY = {"sky": {"type": "constant", "radiance": 0.5}}  # behind it, where little else has light
+SKY = {"sky": {"type": "constant", "radiance": 0.5}}  # lights that vertex, which turns away from lamps
 
 
 def round_mesh(segments: int) -> tuple[np.ndarray, np.ndarray]:
@@ -83,9 +83,10 @@ MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
 
 
 def smooth_scene(mesh: str, material: str, depth: int, camera: Callable[[], dict], around: dict) -> mi.Scene:
+    """`around`: what lights it in place of lamps."""
     points, faces = MESHES[mesh]()
     shape = meshes.smooth_mesh("shape", points, faces, mi.load_dict(MATERIALS[material][0]))
-    lights = {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
+    lights = {} if material == "light" or around else {"lamp": lamp(*LAMP), "point": POINT}
     return scene_of(depth, camera(), shape=shape, floor=ground(-1.3), **lights, **around)
 
 
