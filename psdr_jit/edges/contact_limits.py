@@ -86,6 +86,15 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             memory,
         )
     for lamp, other in contacts.lamps:
+        if job.options.hide_emitters:
+            warn_once(
+                f"the area light '{shown_name(lamp)}', which hide_emitters makes transparent, touches "
+                f"'{shown_name(other)}' or cuts into it: where the camera sees that on both sides, a part of the "
+                "derivative is missing (15 % for a ring of light in a floor, as the camera turns); keep them apart by "
+                "a hundredth of their size",
+                UnsupportedWarning,
+                memory,
+            )
         if other.bsdf() is not None and mi.has_flag(other.bsdf().flags(), mi.BSDFFlags.Null):
             warn_once(
                 f"the area light '{shown_name(lamp)}' cuts into '{shown_name(other)}', behind which it is seen: where "

@@ -137,8 +137,8 @@ SUPPORT = (
     Row("batch sensor", "yes", "its sensors are rendered one by one, uncropped; `sample_border` needs equal filters"),
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes",
-        "warning: paint that shares texture coordinates; lights that `hide_emitters` hides before curved shapes; maps "
-        "whose pose does more than to turn them"),
+        "warning: paint that shares texture coordinates; lights that `hide_emitters` hides before curved shapes, or "
+        "where they cut into others; maps whose pose does more than to turn them"),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),

@@ -119,7 +119,7 @@ def scene_of(values: np.ndarray) -> mi.Scene:
     return mi.load_dict({"type": "scene", "camera": camera, "floor": floor, "sky": sky, "thing": body}, optimize=False)
 
 
-@pytest.mark.parametrize(("values", "named"), [(torus(40), False), (torus(12), True)], ids=["fine", "coarse"])
+@pytest.mark.parametrize(("values", "named"), [also(torus(40), False), (torus(12), True)], ids=["fine", "coarse"])
 def test_coarse_grids_are_named(llvm, recwarn, values, named):
     make_plan(scene_of(values), "camera.to_world", integrator={"type": "psdr_path", "max_depth": 2})
     said = [str(w.message) for w in recwarn if issubclass(w.category, UnsupportedWarning)]

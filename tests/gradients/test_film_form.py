@@ -46,7 +46,7 @@ CASES = {  # scene, parameter, motion
     "spline": ("painted_curves", "spline.control_points", {"direction": (0.3, 0.2, 0.1)}),
     "away": ("baffled_light", "blocker.vertex_positions", {"rotate": (0.48, 0.6, 0.64)}),
 }
-FAST = ("moved", "light")
+FAST = ("moved",)
 SLIDING = {"mirrored", "mirror", "glass", "glass-view", "window", "mask", "grid", "gaussians", "rod", "spline"}
 MORE = {"mirror": 4, "window": 4, "glass": 4, "away": 8}  # samples: the spatial form has heavy tails
 KNOWN_TO = dict.fromkeys(("mirror", "window", "glass"), 0.1)  # of gains
@@ -169,7 +169,8 @@ def test_other_things_may_move_as_well(llvm):
     assert abs(float(dr.grad(θ)[0]) - (w * image).sum()) < 1e-5 * bound
 
 
-@pytest.mark.parametrize("param", [CAMERA, also(CARD)])
+@pytest.mark.slow
+@pytest.mark.parametrize("param", [CAMERA, CARD])
 def test_fine_pictures_are_less_noisy(llvm, param):
     """Of slopes of texels the spatial form sees the largest part of their noise."""
     motion = picture_moves(param)

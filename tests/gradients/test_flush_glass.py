@@ -40,7 +40,7 @@ def warned(lift: float, bsdf: dict) -> list[str]:
     also(0.006, "dielectric", False),
     (-0.01, "dielectric", False),
     also(0.0, "diffuse", False),
-    (0.0, "plastic", False),
+    also(0.0, "plastic", False),
 ])  # fmt: skip
 def test_glass_flush_with_a_floor_is_named(llvm, lift, bsdf, named):
     said = [text for text in warned(lift, {"type": bsdf}) if "smooth glass" in text]

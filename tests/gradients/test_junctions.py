@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from helpers import assert_grad_close, fd, forward
+from variants import also
 
 from psdr_jit.derivative.perturbation import perturb
 
@@ -44,10 +45,10 @@ CASES = {
 }
 
 
-SLOW = ("cube-up", "ball-up", "cube-turns", "cube-floor-turns", "tube-up", "tube-turns")  # pieces of the others
+FAST = ("ball-floor-slides",)  # the others are pieces of it, and of other tests
 
 
-@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES])
+@pytest.mark.parametrize("case", [c if c in FAST else also(c) for c in CASES])
 def test_against_finite_differences(llvm, monkeypatch, case):
     from psdr_jit.edges import segments
 

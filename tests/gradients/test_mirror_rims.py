@@ -120,6 +120,7 @@ def test_a_floor_sees_balls(llvm, case):
     assert_grad_close(forward(moved, spec(3), SEEDS, 1024), reference, max_stderr=0.03)
 
 
+@pytest.mark.slow
 def test_a_floor_sees_as_much_of_a_fine_ball_as_of_a_sphere(llvm):
     """What the outline hides, the horizon within its rim brings back: without it, 50 of the sum is missing.
 

@@ -121,6 +121,7 @@ def test_differences_agree(llvm, material, motion):
         assert all(off(wrong) > 3 * MOST_SIGMA for wrong in (0.0, -1.0, 0.5))
 
 
+@pytest.mark.slow
 def test_directions_that_turn_are_less_noisy(llvm, monkeypatch):
     p = perturb(scene("conductor"), SEEN[0], direction=SEEN[1])
     turning = blocks(forward(p, {"type": "psdr_path", **PATHS}, SEEDS, SPP))

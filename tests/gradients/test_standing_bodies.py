@@ -59,7 +59,7 @@ def derivative(scene: mi.Scene, unit: float, param: str, direction: tuple[float,
 
 @pytest.mark.parametrize("elevation", [ELEVATIONS[0], *(also(e) for e in ELEVATIONS[1:])])
 @pytest.mark.parametrize("unit", [also(0.5), also(1.0), 500.0])
-@pytest.mark.parametrize("what", ["box", "tube"])
+@pytest.mark.parametrize("what", ["box", also("tube")])
 def test_a_foot_is_seen_against_the_floor(llvm, what, unit, elevation):
     moved = ("sensor.to_world", (0.3, 1, 0))
     on_it, sunk = (derivative(room(what, unit, elevation, foot), unit, *moved) for foot in (0.0, -0.5))

@@ -130,6 +130,16 @@ def test_a_lamp_in_a_window_is_named(mono):
         assert any("cuts into 'floor', behind which it is seen" in str(w.message) for w in said) == named
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_hidden_lamp_in_a_floor_is_named(mono, hidden):
+    """The floor is seen outside of it and in it, where nothing lights it."""
+    spec = {"type": "psdr_path", "max_depth": 2, "hide_emitters": hidden}
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        psdr_jit.make_plan(sunk(), ["camera.to_world"], integrator=spec)
+    assert any("which hide_emitters makes transparent, touches 'floor'" in str(w.message) for w in said) == hidden
+
+
 def test_a_point_light_on_a_surface(llvm):
     """It casts shadows like one that hangs a little below: Mitsuba's shadow rays end before what it lies on."""
     images = []

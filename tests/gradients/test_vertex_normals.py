@@ -27,7 +27,7 @@ def leaning(kind: dict) -> Perturbation:
     return perturb(scene, NORMALS, np.tile(np.array([0.3, -0.4, 0.9], np.float32), count))
 
 
-KINDS = [also(LIGHT, 4096, 0.9), (REFLECTOR, 1024, 0.02)]
+KINDS = [also(LIGHT, 4096, 0.9), also(REFLECTOR, 1024, 0.02)]
 
 
 @pytest.mark.parametrize("kind, spp, off", KINDS, ids=["light", "reflector"])

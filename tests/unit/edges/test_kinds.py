@@ -227,7 +227,8 @@ def cut_ball(ball, places: str, base: type) -> tuple[mi.Scene, EdgeKind]:
     """A ball about the origin that a wall cuts into, and its outlines."""
     T = mi.ScalarTransform4f
     wall = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 20).translate([0, 0, -0.9 * RADIUS]).scale(3)}
-    sensor = {"type": "perspective", "to_world": T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])}
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    sensor = {"type": "perspective", "to_world": T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), "film": film}
     scene = mi.load_dict({"type": "scene", "ball": ball, "wall": wall, "light": {"type": "constant"}, "sensor": sensor,
                           "integrator": {"type": "psdr_path", "max_depth": 2, "sppc": 1}})  # fmt: skip
     with also_enabled(scene, [f"ball.{places}"]):

@@ -97,6 +97,7 @@ def test_only_what_slides_has_rims(llvm):
     assert SphereRims.of(job_of(scenes[1], "before.bsdf.reflectance.value", 1)) is None
 
 
+@pytest.mark.slow
 def test_the_variance_no_longer_comes_from_the_outline(llvm, monkeypatch):
     """A ball of glass moves before a picture: the same image, of which pixels at the outline were far noisier."""
     scene = scene_io.load_scene(scene_io.shipped_scene("glass.xml"), res=16)
