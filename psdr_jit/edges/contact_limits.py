@@ -48,13 +48,15 @@ class Touching:
 
     lamps: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # an area light, and what it touches at an angle
     movers: tuple[mi.Shape, mi.Shape] | None = None  # of which one moves against the other
+    standing: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # of `lamps`, those with an edge or a face in the other
     glass: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # smooth glass, and what a face of it is flush with
 
 
 def touching(found: EdgeSet, memory: Memory) -> Touching:
     """Of the edges that were found."""
     glass = tuple(_flush_glass(found, memory))
-    return Touching(tuple(_touching_lamps(found, memory)), next(_moved_against(found), None), glass)
+    standing, cut = tuple(_with_lamp(_standing(found, memory))), tuple(_with_lamp(_cut(found)))
+    return Touching(standing + cut, next(_moved_against(found), None), standing, glass)
 
 
 def warn_about_contacts(job: Job, contacts: Touching) -> None:
@@ -85,16 +87,16 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             UnsupportedWarning,
             memory,
         )
+    for lamp, other in contacts.standing if job.options.hide_emitters else ():
+        warn_once(
+            f"the area light '{shown_name(lamp)}', which hide_emitters makes transparent, stands on "
+            f"'{shown_name(other)}': where the camera sees through it what it stands on, a part of the derivative is "
+            "missing (a quarter for a cube of light on a floor, as the camera moves); lift it by a hundredth of its "
+            "size, or sink it in",
+            UnsupportedWarning,
+            memory,
+        )
     for lamp, other in contacts.lamps:
-        if job.options.hide_emitters:
-            warn_once(
-                f"the area light '{shown_name(lamp)}', which hide_emitters makes transparent, touches "
-                f"'{shown_name(other)}' or cuts into it: where the camera sees that on both sides, a part of the "
-                "derivative is missing (15 % for a ring of light in a floor, as the camera turns); keep them apart by "
-                "a hundredth of their size",
-                UnsupportedWarning,
-                memory,
-            )
         if other.bsdf() is not None and mi.has_flag(other.bsdf().flags(), mi.BSDFFlags.Null):
             warn_once(
                 f"the area light '{shown_name(lamp)}' cuts into '{shown_name(other)}', behind which it is seen: where "
@@ -133,14 +135,24 @@ def _bent(mesh: mi.Mesh) -> bool:
         return any(bool(dr.any(dr.dot(n, mesh.vertex_normal(corner)) < UNBENT)[0]) for corner in faces)
 
 
-def _touching_lamps(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
-    """Pairs with a light that meet at an angle: a flat light on a ceiling, in its plane, does not shine on that."""
-    pairs = [(c.a.mesh, c.b.mesh) for c in found.contacts if c.a is not c.b and _with_lamp_at_an_angle(c, memory)]
-    for first, second in found.junctions.pairs if found.junctions is not None else ():
-        if first is not second:
-            pairs.append((_shape(first), _shape(second)))
+def _with_lamp(pairs: Iterator[tuple[mi.Shape, mi.Shape]]) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Those with a light, which comes first."""
     for a, b in pairs:
         yield from (pair for pair in ((a, b), (b, a)) if pair[0].is_emitter())
+
+
+def _standing(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs with a light that meet at an angle: a flat light on a ceiling, in its plane, does not shine on that."""
+    for c in found.contacts:
+        if c.a is not c.b and _with_lamp_at_an_angle(c, memory):
+            yield c.a.mesh, c.b.mesh
+
+
+def _cut(found: EdgeSet) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs that cut into each other."""
+    for first, second in found.junctions.pairs if found.junctions is not None else ():
+        if first is not second:
+            yield _shape(first), _shape(second)
 
 
 def _with_lamp_at_an_angle(c: Contact, memory: Memory) -> bool:

@@ -33,6 +33,7 @@ class Junctions(BetweenFaces):
     curves: JunctionRows
     centre: mi.Point3f  # of the scene
     surfaces: Surfaces | None
+    transparent: mi.Bool  # by row: is one of the surfaces a light that the sensor looks through?
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
         """Being behind one of the surfaces is enough to be hidden."""
@@ -77,7 +78,8 @@ class Junctions(BetweenFaces):
         Along a surface seen at a grazing angle, a step to the side is many times as long, and would lead across the
         thin shadow that begins at the curve. Of a step along a surface with normal n, |n·ω| / |ω × curve| leads to the
         side; in front is the surface with the larger n·s/(n·ω), s the direction to the side. So much nearer, for a step
-        of 1, the ray has to start: else it begins behind a surface that is seen at a grazing angle.
+        of 1, the ray has to start: else it begins behind a surface that is seen at a grazing angle. A light that the
+        sensor looks through is not what is seen in front: the whole way is gone there.
         """
         n0, n1 = self.normals(row, active)
         s = dr.select(which == 0, -1.0, 1.0) * sight.n_perp
@@ -85,7 +87,8 @@ class Junctions(BetweenFaces):
         f0, f1 = dr.dot(n0, sight.ω), dr.dot(n1, sight.ω)
         nearer0, nearer1 = dr.dot(n0, s) / f0, dr.dot(n1, s) / f1  # by which a step of 1 to the side meets each
         in_front = dr.abs(dr.select(nearer0 > nearer1, f0, f1))
-        share = dr.select(in_front < across, in_front / across, 1)
+        through = dr.gather(mi.Bool, self.transparent, row, active)
+        share = dr.select(~through & (in_front < across), in_front / across, 1)
         step = sight.offset + share * self._in_the_dark(row, sight.at.x, active)
         nearer = dr.clip(step * dr.maximum(nearer0, nearer1), 0, NEAREST * sight.r)
         return Side.found_by(mi.Ray3f(sight.at.x + step * s - (sight.lead + nearer) * sight.ω, sight.ω))

@@ -154,7 +154,8 @@ def _between_faces(
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count
         if rows is not None:
-            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.surfaces))
+            through = _looked_through(job, meshes, rows)
+            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.surfaces, through))
     dr.eval([kind.rows for kind in kinds])  # now, not with the term that needs them first: its kernels would differ
     return kinds, hidden
 
@@ -183,6 +184,14 @@ def _seen_from_outside(job: Job, meshes: list[ShapeFacts]) -> mi.Float:
 def _is_hidden(job: Job, facts: ShapeFacts) -> bool:
     """Does the sensor look through it?"""
     return facts.is_emitter and job.options.hide_emitters
+
+
+def _looked_through(job: Job, meshes: list[ShapeFacts], rows: EdgeRows) -> mi.Bool:
+    """By row: does one of its faces belong to a light that the sensor looks through?"""
+    lights = mi.Float([float(_is_hidden(job, facts)) for facts in meshes])
+    through = sum(dr.gather(mi.Float, lights, shape) for shape in (rows.shape0, rows.shape1)) > 0
+    dr.eval(through)
+    return through
 
 
 def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[EdgeRows | None, mi.UInt32, int]:

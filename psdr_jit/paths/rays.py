@@ -15,8 +15,9 @@ SHADOW_EPSILON = 1e-3
 #: What is added for the rounding of float32 positions, relative to the coordinates: eight units in the last place.
 ROUNDING = 1e-6
 
-#: Distance that a ray advances beyond what it passes through, relative to the coordinates.
-ADVANCE = 1e-5
+#: Distance that a ray advances beyond what it passes through, relative to the coordinates. It may meet that once more,
+#: by rounding, and passes it again; with ten times as much it would miss a floor below, next to where the two meet.
+ADVANCE = 1e-6
 
 
 def shadow_test(scene: mi.Scene, si: mi.SurfaceInteraction3f, ds: mi.DirectionSample3f, active: mi.Bool):
