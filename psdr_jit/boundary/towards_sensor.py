@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..core.sensor_frame import viewpoint
+from ..core.sensor_frame import towards_viewer, viewpoint
 from ..edges.film_cover import LENS_CENTRE
 from ..paths.smooth_lights import share
 from ..plan.job import Job
@@ -15,7 +15,7 @@ from ..plan.job import Job
 def facing_sensor(job: Job, si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     """The same with `wi` towards the middle of the sensor."""
     eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
-    si.wi = si.to_local(dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(si.p)))
+    si.wi = si.to_local(dr.normalize(towards_viewer(eye, si.p)))
     return si
 
 

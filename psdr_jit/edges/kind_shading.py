@@ -16,7 +16,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame, viewpoint
+from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
 from .film_cover import LENS_CENTRE, curve_cover
 from .kind import OnEdge, Use
 from .kind_mirror_horizon import MirroredFace
@@ -41,7 +41,7 @@ class ShadingOutlines(CurvesWithinFaces):
         ends = [curve_on(face, mi.Float(s), eye) for s in (0.0, 1.0)]
         found = ends[0].valid & ends[1].valid
         length = curve_cover(frame, border, face.p, tuple(face.at(end.b) for end in ends), found)
-        front = rows.shell * dr.dot(face.n_g, mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(face.p[0]))
+        front = rows.shell * dr.dot(face.n_g, towards_viewer(eye, face.p[0]))
         hidden = (rows.shell != 0) & (front <= -slack * dr.norm(face.n_g))
         return dr.select(may_cross(face, eye, slack) & ~hidden, length, 0)
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..core.joining import pointers
 from ..core.memory import Slot
-from ..core.sensor_frame import viewpoint
+from ..core.sensor_frame import towards_viewer, viewpoint
 from ..edges.coarse import bent_meshes
 from ..edges.film_cover import LENS_CENTRE
 from ..edges.horizons import Horizons, Targets
@@ -167,5 +167,5 @@ def spread(face: Face) -> mi.Float:
 def _seen(job: Job, shell: mi.Float, n: mi.Vector3f, x: mi.Point3f) -> mi.Float:
     """Cosine at which the middle of the sensor sees the faces; not 0 for those that others may see."""
     eye = viewpoint(job.frame, mi.Point2f(LENS_CENTRE))
-    cos = dr.dot(n, dr.normalize(mi.Vector3f(eye.x, eye.y, eye.z) - eye.w * mi.Vector3f(x)))
+    cos = dr.dot(n, dr.normalize(towards_viewer(eye, x)))
     return dr.maximum(dr.select(shell != 0, cos * shell, dr.abs(cos)), 0) + LEAST
