@@ -13,6 +13,9 @@ from ..errors import UnsupportedError
 from ..options import require_count, require_runtime
 from .ad import backpropagate
 
+#: By number of channels.
+PIXEL_FORMATS = {1: "luminance", 2: "luminance_alpha", 3: "rgb", 4: "rgba"}
+
 #: Quadrature nodes per pixel for the integral of a reconstruction filter.
 FILTER_NODES = 256
 
@@ -209,3 +212,17 @@ def black(film: mi.Film) -> mi.TensorXf:
     """An image of zeros in the film's format."""
     clear(film)
     return film.develop() * 0
+
+
+def film_like(film: mi.Film, size: tuple[int, int], crop: tuple[tuple[int, int], tuple[int, int]] | None = None,
+              sample_border: bool = False) -> mi.Film:  # fmt: skip
+    """A film of another `size` (width, height) with the filter and the channels of `film`.
+
+    `crop`: offset and size of its crop window, by default all of it.
+    """
+    (left, top), (width, height) = crop or ((0, 0), size)
+    return mi.load_dict({
+        "type": "hdrfilm", "width": size[0], "height": size[1], "crop_offset_x": left, "crop_offset_y": top,
+        "crop_width": width, "crop_height": height, "rfilter": film.rfilter(), "sample_border": sample_border,
+        "pixel_format": PIXEL_FORMATS[black(film).shape[2]], "component_format": "float32",
+    })  # fmt: skip

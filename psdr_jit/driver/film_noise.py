@@ -14,7 +14,7 @@ import numpy as np
 
 from ..core.film_samples import FilmDensity, smoothed
 
-#: Rows and columns of what is kept, at most: it travels with the plan.
+#: Rows and columns of what is kept, at most: it travels with the plan. A pilot draws no more of them than that.
 MOST_CELLS = 256
 
 #: Least share of what was seen last: the scene changes as an optimisation goes on.
@@ -25,12 +25,16 @@ FORGET = 0.2
 BELIEVED, SEEN_TWICE = 0.95, 4.0
 
 
+def pixels_per_cell(height: int, width: int) -> int:
+    """Rows and columns of pixels that are one cell, so that there are `MOST_CELLS` a side at most."""
+    return -(-max(height, width) // MOST_CELLS)
+
+
 def coarse(image: np.ndarray) -> np.ndarray:
-    """Means of an image (H, W) over blocks of pixels, of which there are `MOST_CELLS` a side at most."""
-    rows, columns = (-(-n // MOST_CELLS) for n in image.shape)
-    margin = [(0, -image.shape[0] % rows), (0, -image.shape[1] % columns)]
-    padded = np.pad(image, margin, mode="edge")
-    return padded.reshape(padded.shape[0] // rows, rows, -1, columns).mean((1, 3))
+    """Means of an image (H, W) over cells, see `pixels_per_cell`."""
+    n = pixels_per_cell(*image.shape)
+    padded = np.pad(image, [(0, -size % n) for size in image.shape], mode="edge")
+    return padded.reshape(padded.shape[0] // n, n, -1, n).mean((1, 3))
 
 
 @dataclass(frozen=True, eq=False)

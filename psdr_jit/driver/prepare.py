@@ -31,6 +31,7 @@ from ..scene.facts import SceneFacts, analyse
 from ..scene.mesh_tables import CallVariables
 from ..scene.tangent_facts import facts_along_tangents
 from . import pilot
+from .fewer_pixels import on_fewer_pixels
 from .noise_log import NoiseLog
 from .pilot import Measurement
 from .question import Question
@@ -240,6 +241,8 @@ def _pilot(q: Question, plan: Plan, forms: tuple[str, ...], names: set[str], epo
     """The pilot of this epoch; run unless an integrator with the same memory has done so."""
     found = q.call.memory[PILOTS].setdefault(_kind(q, forms), {})
     if epoch not in found:
+        call = on_fewer_pixels(q.call)
+        q = q if call is q.call else replace(q, call=call, shared=Memory())
 
         def job_of(form: str, seed: int, spp: int) -> Job:
             call = replace(q.call, seed=seed, counters=Counters())

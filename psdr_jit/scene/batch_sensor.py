@@ -13,11 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.film import black
+from ..core.film import PIXEL_FORMATS, black, film_like
 from .graph import child_objects, plugin_name
-
-#: By number of channels.
-PIXEL_FORMATS = {1: "luminance", 2: "luminance_alpha", 3: "rgb", 4: "rgba"}
 
 
 @dataclass(frozen=True)
@@ -61,10 +58,7 @@ def _film(of_batch: mi.Film, own: mi.Film) -> mi.Film:
     if _format(own) == _format(of_batch):
         return own
     width, height = own.crop_size()
-    return mi.load_dict({
-        "type": "hdrfilm", "width": int(width), "height": int(height), "rfilter": of_batch.rfilter(),
-        "pixel_format": PIXEL_FORMATS[_format(of_batch)[1]], "component_format": "float32",
-    })  # fmt: skip
+    return film_like(of_batch, (int(width), int(height)))
 
 
 def _border(film: mi.Film) -> int:
