@@ -25,8 +25,9 @@ COUNT = int(os.environ.get("PSDR_FUZZ_SEEDS", "20"))
 SHRINK_SECONDS = 180.0
 #: Seeds that were wrong once: a shadow thinner than the height at which rays start; a contact on a face seen edge-on;
 #: a ball that cuts into a prism, where its outline comes out of it; a coarse smooth-shaded light that turns in place
-#: (warned about since); a light closer to what it shines on than a thousand times the height at which rays start.
-FOUND = (461, 509, 544, 704, 2082, 3049, 3295)
+#: (warned about since); a light closer to what it shines on than a thousand times the height at which rays start;
+#: the inner wall of a tube, seen past its rim and edge-on.
+FOUND = (461, 509, 544, 704, 2082, 3049, 3295, 16175)
 LOADED = 40  # seeds of the quick test
 WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 

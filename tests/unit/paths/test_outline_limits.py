@@ -37,6 +37,18 @@ def test_normals_beside_an_outline_are_those_of_the_outline(llvm, shape, bsdf):
     assert np.array(seen.sh_frame.n)[:, 0] == pytest.approx([1, -GRAZING, 0], abs=5e-6)
 
 
+@pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+def test_an_inner_wall_stays_as_it_is(llvm, shape):
+    """Next to a rim it is met edge-on as well, but has no outline there: moved to one, it lay behind the outer wall."""
+    scene = scene_of(shape, {"type": "twosided", "bsdf": {"type": "diffuse"}})
+    d = mi.Vector3f(0, 1, 0)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(RADIUS * (1 - INSIDE), 0, 0.0 if shape == "sphere" else 0.2), d))
+    assert float(si.p.y[0]) == pytest.approx(RADIUS * np.sqrt(2 * INSIDE), rel=0.03)
+    place, normal = np.array(si.p), np.array(si.sh_frame.n)
+    seen = edge_on_of(scene).at_limit(si, d, mi.Bool(True))
+    assert np.array_equal(seen.p, place) and np.array_equal(seen.sh_frame.n, normal)
+
+
 def test_a_surface_that_scatters_nothing_has_no_such_limit(llvm):
     assert edge_on_of(scene_of("sphere", BLACK)) is None
     assert edge_on_of(scene_of("rectangle", {"type": "diffuse"})) is None
