@@ -35,7 +35,7 @@ from ..core.varying import varying
 from ..errors import UnsupportedError
 from ..paths.bounce import PathLimits, particle_eval
 from ..paths.delta_step import delta_step
-from ..paths.edge_on import GRAZING
+from ..paths.edge_on import met_edge_on
 from ..paths.light_source import LightStart
 from ..paths.light_walk import LightPath
 from ..paths.rays import interaction
@@ -119,7 +119,7 @@ def _write(path: LightPath, start: LightStart, subpath: Subpaths, limits: PathLi
         here = subpath.vertex(k, active)
         hit = met_from(o, here)
         si = interaction(hit.intersection(), mi.Ray3f(o, hit.d, 0, start.ray.wavelengths), limits)
-        sound &= dr.abs_dot(si.n, hit.d) >= GRAZING
+        sound &= ~met_edge_on(si, hit.d)
         last = k + 1 == n
         records.write(k, hit, here.delta & ~last, active)
         following = subpath.vertex(k + 1, active & ~last)

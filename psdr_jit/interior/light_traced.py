@@ -32,7 +32,7 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.bounce import PathLimits
 from ..paths.delta_step import delta_step
-from ..paths.edge_on import GRAZING
+from ..paths.edge_on import GRAZING, first_cosine, met_edge_on
 from ..paths.light_source import LightStart
 from ..paths.light_technique import average
 from ..paths.light_vertices import LightVertices
@@ -135,7 +135,7 @@ def turn_around(
 ) -> mi.Bool:
     """Write the paths into `records` in the order in which the camera meets them. Detached.
 
-    Returns the lanes that have a derivative: no vertex is met edge-on (`GRAZING`), and the light is where it was.
+    Returns the lanes that have a derivative: no vertex is met edge-on (`met_edge_on`), and the light is where it was.
     """
     n = mi.UInt32(path.count)
     here = subpath.vertex(n - 1, n > 0)
@@ -149,7 +149,7 @@ def turn_around(
     while dr.hint(active, label="psdr.turn_around", exclude=[job, limits, path, start, subpath]):
         hit = met_from(o, here)
         si = interaction(hit.intersection(), mi.Ray3f(o, hit.d, 0, start.ray.wavelengths), limits)
-        sound &= dr.abs_dot(si.n, hit.d) >= GRAZING
+        sound &= ~met_edge_on(si, hit.d, dr.select(k == 0, first_cosine(job.sensor), GRAZING))
         last = k + 1 == n
         following = subpath.vertex(n - 2 - k, active & ~last)
         o = mi.Point3f(si.spawn_ray_to(following.x).o)  # off the surface: a sphere is met again from its inside

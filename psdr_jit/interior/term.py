@@ -18,6 +18,7 @@ from ..core.streams import Stream
 from ..edges.followed_lights import followed_lights
 from ..options import Options
 from ..paths.dry_walk import count_vertices, touches
+from ..paths.edge_on import first_cosine
 from ..paths.recording import PathRecords
 from ..paths.scattering import UNIFORM_SHARE
 from ..paths.smooth_lights import SmoothLights, has_smooth_lights
@@ -118,7 +119,7 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
     depth = limits.max_depth
     if job.options.max_depth == -1:
         depth = count_vertices(job.scene, p.sampler(lane), ray, limits, job.options.hide_emitters)
-    records = PathRecords(dr.width(lane), depth)
+    records = PathRecords(dr.width(lane), depth, first_cosine(job.sensor))
     ray, pi, emission = first_hit(job.scene, ray, job.options.hide_emitters)
     sampler = p.sampler(lane)
     dr.eval(sampler)  # for one kernel, whatever the samples are of

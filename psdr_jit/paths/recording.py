@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Hit, Vertex
 from ..core.varying import varying
-from .edge_on import GRAZING
+from .edge_on import GRAZING, met_edge_on
 from .rays import shadow_hit
 from .sink import NoSink, Scatter, Sink
 
@@ -16,12 +16,13 @@ class PathRecords(Sink):
     """Vertices of `lanes` paths, at most `depth` each, vertex-major (`k * lanes + lane`) so that lanes coalesce.
 
     A plain class on purpose: Dr.Jit must not take the buffers for loop state. Costs `BYTES_RGB` per vertex.
+    `first_cos`: see `edge_on.first_cosine`.
     """
 
     BYTES_RGB = 4 * (11 + 3 + 1 + 11 + 2) + 2
 
-    def __init__(self, lanes: int, depth: int):
-        self.lanes, self.depth = lanes, depth
+    def __init__(self, lanes: int, depth: int, first_cos: float = GRAZING):
+        self.lanes, self.depth, self.first_cos = lanes, depth, first_cos
         self.stride = varying(mi.UInt32, lanes)
         self.lane = dr.arange(mi.UInt32, lanes)
         self.count = mi.UInt32(0)  # vertices stored, per lane; set by whoever ran the walk
@@ -40,8 +41,8 @@ class PathRecords(Sink):
         """Store the vertex. Where it is met edge-on the record ends: how it slides, single precision cannot tell."""
         index = k * self.stride + self.lane
         dr.scatter(self.vertices, scatter.record(), index, active, mode=dr.ReduceMode.Permute)
-        si, arrival = scatter.si, scatter.hit.d
-        edge_on = active & si.is_valid() & (dr.abs(dr.dot(si.n, arrival)) < GRAZING)
+        triangles = dr.select(k == 0, self.first_cos, GRAZING)
+        edge_on = active & scatter.si.is_valid() & met_edge_on(scatter.si, scatter.hit.d, triangles)
         # every lane has its own entry; any other mode would compile a kernel for every number of lanes
         mode = dr.ReduceMode.NoConflicts
         dr.scatter_reduce(dr.ReduceOp.Min, self.whole, k, self.lane, edge_on, mode=mode)

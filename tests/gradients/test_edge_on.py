@@ -120,6 +120,25 @@ def test_a_face_that_is_barely_seen(llvm, smooth):
     assert np.linalg.norm(images[0] - images[1]) < 0.02 * np.linalg.norm(images[1])
 
 
+def test_a_face_that_parallel_rays_meet_nearly_edge_on(llvm):
+    """It is a thousandth of a pixel of other films, where what changes along it is a step; here it fills the film.
+
+    Tilted by SLOPE against the rays and lit by a lamp at unit distance, it shows L(z) = I ρ / (π r³) at x = SLOPE z.
+    """
+    slope, height, half_film = 3e-4, -0.3, 1e-4
+    corners = np.array([[slope * z, y, z] for z in (-0.5, 0.5) for y in (-1e-3, 1e-3)])
+    sheet = meshes.flat_mesh("sheet", corners, np.array([[0, 1, 3], [0, 3, 2]]), mi.load_dict({"type": "diffuse"}))
+    pose = T().translate([0, 0, -4]).scale([half_film, half_film, 1])
+    camera = {"type": "orthographic", "to_world": pose, "film": film() | {"rfilter": {"type": "box"}}}
+    lamp = {"type": "point", "position": [1, 0, height], "intensity": 10.0}
+    scene = mi.load_dict({"type": "scene", "camera": camera, "sheet": sheet, "lamp": lamp}, optimize=False)
+    estimate = forward(perturb(scene, "sheet.vertex_positions", (1, 0, 0)), SPEC | {"form": "spatial"}, 8, 256)
+    x = np.linspace(half_film, -half_film, 17)  # the camera's x axis points the other way
+    radiance = 10 * 0.5 / np.pi * (1 + (x / slope - height) ** 2) ** -1.5
+    exact = -np.diff(radiance) / np.diff(x)
+    assert_grad_close(estimate, np.tile(exact[None, :, None], (16, 1, 1)), 0.015, 0.006)  # places are rounded, as rays begin 4 units away
+
+
 @pytest.mark.slow
 def test_the_inside_of_an_open_box(llvm):
     """Its walls are borders seen edge-on, and the edges at its bottom the outline; nothing hides them."""
