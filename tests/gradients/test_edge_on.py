@@ -123,7 +123,7 @@ def test_a_face_that_is_barely_seen(llvm, smooth):
 def test_a_face_that_parallel_rays_meet_nearly_edge_on(llvm):
     """It is a thousandth of a pixel of other films, where what changes along it is a step; here it fills the film.
 
-    Tilted by SLOPE against the rays and lit by a lamp at unit distance, it shows L(z) = I ρ / (π r³) at x = SLOPE z.
+    Tilted by a slope against the rays and lit by a lamp at unit distance, it shows I ρ / (π r³) at x = slope · z.
     """
     slope, height, half_film = 3e-4, -0.3, 1e-4
     corners = np.array([[slope * z, y, z] for z in (-0.5, 0.5) for y in (-1e-3, 1e-3)])
@@ -136,7 +136,8 @@ def test_a_face_that_parallel_rays_meet_nearly_edge_on(llvm):
     x = np.linspace(half_film, -half_film, 17)  # the camera's x axis points the other way
     radiance = 10 * 0.5 / np.pi * (1 + (x / slope - height) ** 2) ** -1.5
     exact = -np.diff(radiance) / np.diff(x)
-    assert_grad_close(estimate, np.tile(exact[None, :, None], (16, 1, 1)), 0.015, 0.006)  # places are rounded, as rays begin 4 units away
+    # Places on the film are rounded: rays begin 4 units away.
+    assert_grad_close(estimate, np.tile(exact[None, :, None], (16, 1, 1)), 0.015, 0.006)
 
 
 @pytest.mark.slow
