@@ -31,7 +31,7 @@ import mitsuba as mi
 from ..core.records import Arrival, EmitterSample, Hit, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
-from ..paths.edge_on import GRAZING, GRAZING_FLAT
+from ..paths.edge_on import GRAZING, GRAZING_FLAT, least_cosine
 from ..paths.orbits import Orbits
 from ..paths.rays import ROUNDING
 from ..paths.recording import PathRecords
@@ -117,7 +117,7 @@ def material_segment(
     area = mi.Float(1) if rests else _area_element(si, on_surface)
     cos = dr.abs_dot(si.n, ω)
     # A light or surface seen edge-on changes by 1/cosθ, and its cosine is rounding: see `GRAZING`.
-    usable = on_surface & (cos > dr.select(si.shape.is_mesh(), flat, GRAZING)) & (area > 0)
+    usable = on_surface & (cos > least_cosine(si.shape, flat)) & (area > 0)
     measure = dr.select(usable, cos / dist2 * area, 1)
     return si, ω, dr.relative_grad(measure)
 

@@ -48,12 +48,17 @@ def first_cosine(sensor: mi.Sensor) -> float:
     return GRAZING_PARALLEL if KINDS.get(sensor.class_name()) == "orthographic" else GRAZING
 
 
+def least_cosine(shape: mi.ShapePtr, triangles: mi.Float | float = GRAZING) -> mi.Float:
+    """Cosine below which `shape` is taken to be met edge-on; `triangles`: the same of meshes."""
+    return dr.select(shape.is_mesh(), triangles, GRAZING)
+
+
 def met_edge_on(si: mi.SurfaceInteraction3f, d: mi.Vector3f, triangles: mi.Float | float = GRAZING) -> mi.Bool:
     """Does a ray along `d` meet the surface so nearly edge-on that single precision cannot tell how it slides?
 
-    `triangles`: cosine below which it does so with them.
+    `triangles`: see `least_cosine`.
     """
-    return dr.abs_dot(si.n, d) < dr.select(si.shape.is_mesh(), triangles, GRAZING)
+    return dr.abs_dot(si.n, d) < least_cosine(si.shape, triangles)
 
 
 @dataclass(frozen=True)
