@@ -23,6 +23,9 @@ from .kind_mirror_horizon import MirroredFace
 from .kind_within_faces import CurvesWithinFaces
 from .shading_curve import Face, curve_on, may_cross
 
+#: By how much normals turn over a face, at most, if that is but their rounding [rad].
+FLAT = 1e-6
+
 
 class ShadingOutlines(CurvesWithinFaces):
     """Where n is the interpolated normal."""
@@ -52,7 +55,7 @@ class ShadingOutlines(CurvesWithinFaces):
         rows, face = self.faces.rows, self.all_faces()
         bend = face.gradient_norm * dr.sqrt(0.5) / dr.norm(face.n[0] + face.n[1] + face.n[2]) * 3
         weight = face.area * bend * dr.select(rows.shell != 0, 0.5, 1) * dr.pi
-        return dr.select(dr.isfinite(weight), weight, 0)
+        return dr.select(dr.isfinite(weight) & (bend * dr.sqrt(face.area) > FLAT), weight, 0)
 
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         rows, face = self.face(row, active)
