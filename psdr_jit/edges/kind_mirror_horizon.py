@@ -29,9 +29,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
-from .film_cover import LENS_CENTRE, curve_cover
-from .kind import OnEdge, Use
+from .kind import Use
 from .kind_within_faces import CurvesWithinFaces
 from .shading_curve import ALTERNATIONS, CurvePoint, Face
 
@@ -164,18 +162,6 @@ class MirrorHorizons(CurvesWithinFaces):
     def other_curve(self, face: Face) -> Face:
         return Face(face.p, face.n)
 
-    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
-        """Length of the curve on the film; where only a part of it, or of the lens, sees one, that of the face."""
-        rows, face = self.faces.rows, self.all_faces()
-        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        slack = frame.aperture if frame.kind == "thinlens" else mi.Float(0)
-        ends = [face.curve(mi.Float(s), eye) for s in (0.0, 1.0)]
-        found = ends[0].valid & ends[1].valid
-        length = curve_cover(frame, border, face.p, tuple(face.at(end.b) for end in ends), found)
-        front = rows.shell * dr.dot(face.n_g, towards_viewer(eye, face.p[0]))
-        hidden = (rows.shell != 0) & (front <= -slack * dr.norm(face.n_g))
-        return dr.select(face.may_cross(eye, slack) & ~hidden, length, 0)
-
     def line_weights(self, use: Use) -> mi.Float:
         """As of shading outlines, but that M turns twice as fast, and that the face is seen at the angle of M to its
         plane at most. Beside mirrors that move, or see what does, directions are kept: there is no other use.
@@ -184,12 +170,4 @@ class MirrorHorizons(CurvesWithinFaces):
             return dr.zeros(mi.Float, self.count)
         face = self.all_faces()
         tilt = sum(face.tilt(b) for b in CORNERS) / 3
-        bend = 2 * face.gradient_norm * dr.sqrt(0.5) / dr.norm(face.n[0] + face.n[1] + face.n[2]) * 3
-        weight = face.area * bend * tilt * dr.select(self.faces.rows.shell != 0, 0.5, 1) * dr.pi
-        return dr.select(dr.isfinite(weight), weight, 0)
-
-    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
-        rows, face = self.face(row, active)
-        curve = face.curve(t, view)
-        seen = self.seen(rows, face, curve.ω)
-        return self.point(face, curve.b, curve.ω, curve.weight, active & curve.valid & seen)
+        return 2 * tilt * self.bends(face)

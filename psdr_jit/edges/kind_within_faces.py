@@ -24,6 +24,8 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
+from .film_cover import LENS_CENTRE, curve_cover
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Views
 from .lights import LightBounds
 from .location import EdgeLocation
@@ -33,6 +35,9 @@ from .smooth_faces import FaceRows, SmoothFaces
 
 #: Barycentric step to the side at which the radiance of the face is taken.
 STEP_ASIDE = 1e-3
+
+#: By how much normals turn over a face, at most, if that is but their rounding [rad].
+FLAT = 1e-6
 
 #: Where it would lead across the face's other curve, the share of the way there.
 SHORT_OF_IT = 0.5
@@ -81,8 +86,34 @@ class CurvesWithinFaces(EdgeKind):
         rows = dr.gather(FaceRows, self.faces.rows, row, active)
         return rows, self.of_corners(*self.faces.corners(rows.corner, active))
 
+    def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        """Length of the curve on the film; where only a part of it, or of the lens, sees one, that of the face."""
+        rows, face = self.faces.rows, self.all_faces()
+        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
+        slack = frame.aperture if frame.kind == "thinlens" else mi.Float(0)
+        ends = [face.curve(mi.Float(s), eye) for s in (0.0, 1.0)]
+        found = ends[0].valid & ends[1].valid
+        length = curve_cover(frame, border, face.p, tuple(face.at(end.b) for end in ends), found)
+        front = rows.shell * dr.dot(face.n_g, towards_viewer(eye, face.p[0]))
+        hidden = (rows.shell != 0) & (front <= -slack * dr.norm(face.n_g))
+        return dr.select(face.may_cross(eye, slack) & ~hidden, length, 0)
+
     def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
         return dr.full(mi.Bool, False, self.count)
+
+    def bends(self, face: Face) -> mi.Float:
+        """By face: its area × mean |∇h| of the interpolated normal × the angle of the great circle, halved as an edge's
+        azimuths are (4π sr count as 2π). 0 where normals turn by rounding alone.
+        """
+        bend = face.gradient_norm * dr.sqrt(0.5) / dr.norm(face.n[0] + face.n[1] + face.n[2]) * 3
+        weight = face.area * bend * dr.select(self.faces.rows.shell != 0, 0.5, 1) * dr.pi
+        return dr.select(dr.isfinite(weight) & (bend * dr.sqrt(face.area) > FLAT), weight, 0)
+
+    def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
+        rows, face = self.face(row, active)
+        curve = face.curve(t, view)
+        seen = self.seen(rows, face, curve.ω)
+        return self.point(face, curve.b, curve.ω, curve.weight, active & curve.valid & seen)
 
     def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
         rows, face = self.face(row, active)

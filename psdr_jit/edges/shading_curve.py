@@ -15,6 +15,16 @@ ALTERNATIONS = 1024
 
 
 @dataclass
+class CurvePoint:
+    """A point of the curve as seen from a viewpoint."""
+
+    b: mi.Point2f
+    ω: mi.Vector3f  # unit, from the viewpoint to it
+    weight: mi.Float  # |∂x/∂s × ∂x/∂r| / |∂h/∂r| [m³]
+    valid: mi.Bool
+
+
+@dataclass
 class Face:
     """A triangle and the normals at its corners. Barycentric (b1, b2) as Mitsuba's `prim_uv`."""
 
@@ -72,82 +82,70 @@ class Face:
         square -= 2 * dr.dot(d1, d2) * dr.dot(e1, e2)
         return dr.safe_sqrt(square) / dr.norm(self.n_g)
 
+    def _heights(self, view: mi.Vector4f) -> list[mi.Float]:
+        """n·(o − x) at the corners, or n·(direction to the viewer): > 0 where they face it."""
+        eye = mi.Vector3f(view.x, view.y, view.z)
+        return [dr.dot(n, eye - view.w * p) for p, n in zip(self.p, self.n, strict=True)]
 
-@dataclass
-class CurvePoint:
-    """A point of the curve as seen from a viewpoint."""
+    def may_cross(self, view: mi.Vector4f, slack: mi.Float) -> mi.Bool:
+        """False where no point of the face turns away from any viewpoint within `slack` of `view` [m], or all of them.
 
-    b: mi.Point2f
-    ω: mi.Vector3f  # unit, from the viewpoint to it
-    weight: mi.Float  # |∂x/∂s × ∂x/∂r| / |∂h/∂r| [m³]
-    valid: mi.Bool
+        Between corners, n·(o − x) departs from its interpolation by at most a quarter of |Δn·Δx|.
+        """
+        g = self._heights(view)
+        reach = [slack * dr.norm(n) for n in self.n]
+        bulge = mi.Float(0)
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            bulge = dr.maximum(bulge, dr.abs(dr.dot(self.n[j] - self.n[i], self.p[j] - self.p[i])) / 4)
+        bulge *= view.w
+        low = dr.minimum(dr.minimum(g[0] - reach[0], g[1] - reach[1]), g[2] - reach[2])
+        high = dr.maximum(dr.maximum(g[0] + reach[0], g[1] + reach[1]), g[2] + reach[2])
+        return (low - bulge <= 0) & (high + bulge >= 0)
 
+    def curve(self, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
+        """The curve on the way from the corner that lies alone on its side of it to the point s of the opposite side.
 
-def _heights(face: Face, view: mi.Vector4f) -> list[mi.Float]:
-    """n·(o − x) at the corners, or n·(direction to the viewer): > 0 where they face it."""
-    return [dr.dot(n, mi.Vector3f(view.x, view.y, view.z) - view.w * p) for p, n in zip(face.p, face.n, strict=True)]
+        Where no corner is alone, or that way crosses the curve twice, each of both points takes every other of many
+        small intervals of s, and counts twice.
+        """
+        g = self._heights(view)
+        positive = [value > 0 for value in g]
+        alone = [(positive[k] != positive[(k + 1) % 3]) & (positive[k] != positive[(k + 2) % 3]) for k in range(3)]
 
+        def turned(values: list, k: int):
+            """Entry k after the lone corner."""
+            first, second = values[(1 + k) % 3], values[(2 + k) % 3]
+            return dr.select(alone[1], first, dr.select(alone[2], second, values[k % 3]))
 
-def may_cross(face: Face, view: mi.Vector4f, slack: mi.Float) -> mi.Bool:
-    """False where no point of the face turns away from any viewpoint within `slack` of `view` [m]: or all of them do.
+        eye, w = mi.Vector3f(view.x, view.y, view.z), view.w
+        p = [mi.Vector3f(turned(self.p, k)) for k in range(3)]
+        n = [mi.Vector3f(turned(self.n, k)) for k in range(3)]
+        end, n_end = p[1] + s * (p[2] - p[1]), n[1] + s * (n[2] - n[1])
+        # (1 − r)² c0 + r (1 − r) c1 + r² c2
+        c0, c2 = dr.dot(n[0], eye - w * p[0]), dr.dot(n_end, eye - w * end)
+        c1 = dr.dot(n[0], eye - w * end) + dr.dot(n_end, eye - w * p[0])
+        square, linear = c0 - c1 + c2, c1 - 2 * c0
+        under_root = dr.square(linear) - 4 * square * c0
+        q = -0.5 * (linear + dr.select(linear < 0, -1.0, 1.0) * dr.safe_sqrt(under_root))
+        r1, r2 = q / square, c0 / q
+        in1, in2 = ((r > 0) & (r < 1) for r in (r1, r2))
+        turn = s * ALTERNATIONS
+        odd = turn - dr.floor(turn) < 0.5
+        both = in1 & in2
+        take1 = in1 & (~in2 | odd)
+        r = dr.select(take1, r1, r2)
 
-    Between corners, n·(o − x) departs from its interpolation by at most a quarter of |Δn·Δx|.
-    """
-    g = _heights(face, view)
-    reach = [slack * dr.norm(n) for n in face.n]
-    bulge = mi.Float(0)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        bulge = dr.maximum(bulge, dr.abs(dr.dot(face.n[j] - face.n[i], face.p[j] - face.p[i])) / 4)
-    bulge *= view.w
-    low = dr.minimum(dr.minimum(g[0] - reach[0], g[1] - reach[1]), g[2] - reach[2])
-    high = dr.maximum(dr.maximum(g[0] + reach[0], g[1] + reach[1]), g[2] + reach[2])
-    return (low - bulge <= 0) & (high + bulge >= 0)
-
-
-def curve_on(face: Face, s: mi.Float, view: mi.Vector4f) -> CurvePoint:
-    """The curve on the way from the corner that lies alone on its side of it to the point s of the opposite side.
-
-    Where no corner is alone, or that way crosses the curve twice, each of both points takes every other of many small
-    intervals of s, and counts twice.
-    """
-    g = _heights(face, view)
-    positive = [value > 0 for value in g]
-    alone = [(positive[k] != positive[(k + 1) % 3]) & (positive[k] != positive[(k + 2) % 3]) for k in range(3)]
-
-    def turned(values: list, k: int):
-        """Entry k after the lone corner."""
-        first, second = values[(1 + k) % 3], values[(2 + k) % 3]
-        return dr.select(alone[1], first, dr.select(alone[2], second, values[k % 3]))
-
-    eye, w = mi.Vector3f(view.x, view.y, view.z), view.w
-    p = [mi.Vector3f(turned(face.p, k)) for k in range(3)]
-    n = [mi.Vector3f(turned(face.n, k)) for k in range(3)]
-    end, n_end = p[1] + s * (p[2] - p[1]), n[1] + s * (n[2] - n[1])
-    # (1 − r)² c0 + r (1 − r) c1 + r² c2
-    c0, c2 = dr.dot(n[0], eye - w * p[0]), dr.dot(n_end, eye - w * end)
-    c1 = dr.dot(n[0], eye - w * end) + dr.dot(n_end, eye - w * p[0])
-    square, linear = c0 - c1 + c2, c1 - 2 * c0
-    under_root = dr.square(linear) - 4 * square * c0
-    q = -0.5 * (linear + dr.select(linear < 0, -1.0, 1.0) * dr.safe_sqrt(under_root))
-    r1, r2 = q / square, c0 / q
-    in1, in2 = ((r > 0) & (r < 1) for r in (r1, r2))
-    turn = s * ALTERNATIONS
-    odd = turn - dr.floor(turn) < 0.5
-    both = in1 & in2
-    take1 = in1 & (~in2 | odd)
-    r = dr.select(take1, r1, r2)
-
-    x = mi.Vector3f(p[0] + r * (end - p[0]))
-    along = eye - w * x
-    distance = dr.norm(along)
-    slope = dr.abs(2 * square * r + linear)
-    area = dr.norm(dr.cross(r * (p[2] - p[1]), end - p[0]))
-    weights = [1 - r, r * (1 - s), r * s]  # of the corners, the lone one first
-    b1 = dr.select(alone[1], weights[0], dr.select(alone[2], weights[2], weights[1]))
-    b2 = dr.select(alone[1], weights[1], dr.select(alone[2], weights[0], weights[2]))
-    return CurvePoint(
-        mi.Point2f(b1, b2),
-        -along / distance,
-        area * distance / slope * dr.select(both, 2.0, 1.0),
-        (in1 | in2) & (under_root >= 0) & (slope > 0),
-    )
+        x = mi.Vector3f(p[0] + r * (end - p[0]))
+        along = eye - w * x
+        distance = dr.norm(along)
+        slope = dr.abs(2 * square * r + linear)
+        area = dr.norm(dr.cross(r * (p[2] - p[1]), end - p[0]))
+        weights = [1 - r, r * (1 - s), r * s]  # of the corners, the lone one first
+        b1 = dr.select(alone[1], weights[0], dr.select(alone[2], weights[2], weights[1]))
+        b2 = dr.select(alone[1], weights[1], dr.select(alone[2], weights[0], weights[2]))
+        return CurvePoint(
+            mi.Point2f(b1, b2),
+            -along / distance,
+            area * distance / slope * dr.select(both, 2.0, 1.0),
+            (in1 | in2) & (under_root >= 0) & (slope > 0),
+        )
