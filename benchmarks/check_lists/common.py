@@ -75,6 +75,11 @@ def lamp(origin: tuple, size: float, radiance: float) -> dict:
             "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
 
 
+def sky(image: np.ndarray, **settings: Any) -> dict:
+    """An environment map of an array of shape (height, width, 3), whose last column is its first."""
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(image, np.float32)), **settings}
+
+
 LAMP = ((1.9, 3.2, 2.3), 0.5, 18)  # place, half of its side, radiance
 POINT = {"type": "point", "position": [1.9, 3.2, 2.3], "intensity": 20.0}
 

@@ -22,6 +22,7 @@ from benchmarks.check_lists.common import (
     lamp,
     moved,
     scene_of,
+    sky,
     turned,
     unit,
     view,
@@ -81,15 +82,15 @@ def before_background(kind: str, glows: bool) -> mi.Scene:
 
 LIGHTS: dict[str, Callable[[], dict]] = {
     "area light": lambda: lamp(*LAMP),
-    "sky": lambda: {"type": "envmap", "bitmap": mi.Bitmap(_sky()), "to_world": T().rotate(unit(0.2, 1, 0.1), 50)},
+    "sky": lambda: sky(bright_spot(), to_world=T().rotate(unit(0.2, 1, 0.1), 50)),
     "point light": lambda: POINT,
 }
 
 
-def _sky() -> np.ndarray:
+def bright_spot() -> np.ndarray:
     y, x = np.mgrid[0:32, 0:65]
     one = 0.4 + np.exp(-((x % 64 - 20) ** 2 + (y - 9) ** 2) / 30) * 3
-    return np.stack([one, 0.8 * one + 0.1, 0.6 * one + 0.2], -1).astype(np.float32)
+    return np.stack([one, 0.8 * one + 0.1, 0.6 * one + 0.2], -1)
 
 
 def plastic_ball(light: str) -> mi.Scene:
