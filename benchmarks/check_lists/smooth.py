@@ -35,7 +35,7 @@ SEEN_EDGES = 6.0  # width of the view of a vertex that moves
 # Of rough materials: a step in heights of the vertex over its neighbours, seen from closer. Between the outlines of a
 # face and of its shading they are black, on a strip a quarter as wide as that: steps nearly as wide are off by 1 to
 # 4 %, and smaller ones are lost in noise if seen from farther away.
-ROUGH_BULGE_STEP, ROUGH_SEEN_EDGES = 0.0125, 1.5
+ROUGH_BULGE_STEP, ROUGH_SEEN_EDGES = 0.025, 1.5
 #: Mitsuba draws visible normals of `beckmann`, its default, with a density that is up to .4 % off what it says. From as
 #: close by as this, differences of `path` show that: 1 % of the derivative where surfaces are seen at 60 degrees.
 EXACTLY_SAMPLED = {"distribution": "ggx"}
