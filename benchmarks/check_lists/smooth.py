@@ -32,10 +32,10 @@ BESIDE = (1.3, 0.4, -0.7)  # a point of the axis that bodies turn about
 STEP = 0.004  # of differences: a thirtieth of a pixel, which a blurred outline hardly shows
 VERTEX_STEP = 0.008  # the same in edges of the mesh: .02 was off by half a per cent
 SEEN_EDGES = 6.0  # width of the view of a vertex that moves
-# Of rough materials: a step in heights of the vertex over its neighbours, seen from closer. Between the outlines of a
-# face and of its shading they are black, on a strip a quarter as wide as that: steps nearly as wide are off by 1 to
-# 4 %, and smaller ones are lost in noise if seen from farther away.
-ROUGH_BULGE_STEP, ROUGH_SEEN_EDGES = 0.025, 1.5
+# Of rough materials: a step in heights of the vertex over its neighbours, at most in edges, seen from closer. Between
+# the outlines of a face and of its shading they are black, on a strip a quarter as wide as that height: steps nearly as
+# wide are off by 1 to 4 %, and smaller ones are lost in noise if seen from farther away.
+ROUGH_BULGE_STEP, ROUGH_VERTEX_STEP, ROUGH_SEEN_EDGES = 0.025, 0.004, 1.5
 #: Mitsuba draws visible normals of `beckmann`, its default, with a density that is up to .4 % off what it says. From as
 #: close by as this, differences of `path` show that: 1 % of the derivative where surfaces are seen at 60 degrees.
 EXACTLY_SAMPLED = {"distribution": "ggx"}
@@ -157,11 +157,11 @@ def one_vertex(points: np.ndarray, faces: np.ndarray) -> tuple[Motion, Callable[
 
 def one_rough_vertex(points: np.ndarray, faces: np.ndarray) -> tuple[Motion, Callable[[], dict]]:
     """The same vertex, as rough materials need it."""
-    k = outermost(points)
+    k, edge = outermost(points), edge_length(points, faces)
     neighbours = np.setdiff1d(faces[(faces == k).any(1)], k)
     bulge = np.linalg.norm(points[k] - points[neighbours].mean(0))
-    width = ROUGH_SEEN_EDGES * edge_length(points, faces)
-    return outwards(points, k, ROUGH_BULGE_STEP * bulge), close_view(points[k], width)
+    step = min(ROUGH_BULGE_STEP * bulge, ROUGH_VERTEX_STEP * edge)
+    return outwards(points, k, step), close_view(points[k], ROUGH_SEEN_EDGES * edge)
 
 
 def outermost(points: np.ndarray) -> int:
