@@ -33,11 +33,11 @@ STEP = 0.004  # of differences: a thirtieth of a pixel, which a blurred outline 
 VERTEX_STEP = 0.008  # the same in edges of the mesh: .02 was off by half a per cent
 SEEN_EDGES = 6.0  # width of the view of a vertex that moves
 # Of rough materials: a step in heights of the vertex over its neighbours, at most in edges, seen from closer. Between
-# the outlines of a face and of its shading they are black, on a strip a quarter as wide as that height: steps nearly as
-# wide are off by 1 to 4 %, and smaller ones are lost in noise if seen from farther away.
+# the outlines of a face and of its shading they show their backs, metal none, on a strip a quarter as wide as that
+# height: steps nearly as wide are off by 1 to 4 %, and smaller ones are lost in noise if seen from farther away.
 ROUGH_BULGE_STEP, ROUGH_VERTEX_STEP, ROUGH_SEEN_EDGES = 0.025, 0.004, 1.5
 #: Mitsuba draws visible normals of `beckmann`, its default, with a density that is up to .4 % off what it says. From as
-#: close by as this, differences of `path` show that: 1 % of the derivative where surfaces are seen at 60 degrees.
+#: close by as this, differences of `path` show that: 1 to 4 % of what is smooth, where it is seen at 60 degrees.
 EXACTLY_SAMPLED = {"distribution": "ggx"}
 SKY = {"sky": {"type": "constant", "radiance": 0.5}}  # lights that vertex, which turns away from lamps
 BRIGHT_SIDE = (0.6, 0.7, -0.1)  # where the sky is brightest, of which rough materials show an image
