@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,14 +26,15 @@ def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool
     aim, body = table.aim(sight), table.body(sight)
     ray = _between(sight.viewer, aim)
     scale = ray.maxt + varying(mi.Float, job.facts.reach)
+    sheet = _Sheet(body, table.lies_in(sight), scale)
     nearly = ray.maxt * (1 - VISIBILITY_EPSILON)
     if _faceted(job):
-        blocked = _has_behind_it(job, ray, body, scale, active)
+        blocked = _has_behind_it(job, ray, sheet, active)
         unsure = dr.any(body != aim)
     else:
         blocked = _meets(job, ray, nearly, active)
         unsure = mi.Bool(True)
-    return blocked | _has_behind_it(job, _between(ray(nearly), body), body, scale, active & unsure & ~blocked)
+    return blocked | _has_behind_it(job, _between(ray(nearly), body), sheet, active & unsure & ~blocked)
 
 
 def _faceted(job: Job) -> bool:
@@ -48,18 +51,30 @@ def _between(o: mi.Point3f, x: mi.Point3f) -> mi.Ray3f:
     return ray
 
 
-def _has_behind_it(job: Job, ray: mi.Ray3f, body: mi.Point3f, scale: mi.Float, active: mi.Bool) -> mi.Bool:
-    """Do rays meet a surface that has `body` behind it by more than rounding?
+@dataclass
+class _Sheet:
+    """What ends at an edge, or has it inside."""
 
-    `scale`: of the lengths that have been rounded [m]. Faces in line with the viewer are met as well, but the edge lies
-    in their plane.
+    body: mi.Point3f  # a point of it, next to the edge
+    n: mi.Normal3f  # unit, of the face that has the edge inside; else 0
+    scale: mi.Float  # of the lengths that have been rounded [m]
+
+
+def _has_behind_it(job: Job, ray: mi.Ray3f, sheet: _Sheet, active: mi.Bool) -> mi.Bool:
+    """Do rays meet a surface that has the sheet behind it by more than rounding, or back to back with it?
+
+    Faces in line with the viewer are met as well, but the edge lies in their plane. Behind an outline, what lies on the
+    face that turns away is less than rounding behind the one that does not: a shading outline that leaves the outline
+    by a hundredth of its length stays so for a fiftieth of an edge on a ball of 200 segments.
     """
     pi = job.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if job.options.hide_emitters:
         ray, pi = see_through_emitters(job.scene, ray, pi)
     si = surface_at(job.surfaces, pi, ray, mi.RayFlags.Minimal, active)
-    depth = dr.dot(seen_side(si, ray.d), si.p - body)
-    return active & pi.is_valid() & (depth > ROUNDING * scale)
+    met = seen_side(si, ray.d)
+    depth = dr.dot(met, si.p - sheet.body)
+    back_to_back = dr.dot(met, sheet.n) * dr.dot(sheet.n, ray.d) > 0
+    return active & pi.is_valid() & (back_to_back | (depth > ROUNDING * sheet.scale))
 
 
 def _meets(job: Job, ray: mi.Ray3f, length: mi.Float, active: mi.Bool) -> mi.Bool:

@@ -209,6 +209,10 @@ class EdgeKind(ABC):
         """Unit normal of the flat face at the edge that is most nearly in line with ω; 0 where there is none."""
         return mi.Normal3f(0)
 
+    def lies_in(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Normal3f:
+        """Unit normal of the flat face on which the edge lies, away from its borders; 0 where there is none."""
+        return mi.Normal3f(0)
+
     @abstractmethod
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Vector of value 0 whose derivative is the velocity of the edge there, attached, as seen by parallel lines of

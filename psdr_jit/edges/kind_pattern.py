@@ -220,6 +220,10 @@ class MeshPatterns(PatternLines):
         pi.shape = dr.gather(mi.ShapePtr, self.pointers, rows.shape, active)
         return Side(mi.Ray3f(sight.viewer, sight.ω), pi, mi.Bool(False), mi.Bool(True), mi.Bool(True))
 
+    def lies_in(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Normal3f:
+        _, e1, e2 = _face(self.positions, dr.gather(PatternRows, self.lines.rows, row, active), active)
+        return mi.Normal3f(dr.normalize(dr.cross(e1, e2)))
+
 
 def _face(positions: mi.Point3f, rows: PatternRows, active) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
     """A corner of the rows' faces, and the sides from there."""

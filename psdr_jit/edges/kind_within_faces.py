@@ -177,6 +177,9 @@ class CurvesWithinFaces(EdgeKind):
         above = dr.select(dr.abs(towards) < VISIBILITY_EPSILON, dr.sign(towards) * sight.offset, 0)
         return sight.at.x + above * n
 
+    def lies_in(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Normal3f:
+        return mi.Normal3f(dr.normalize(self.face(row, active)[1].n_g))
+
     def displacement(self, row: mi.UInt32, at: EdgeLocation, ω: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
         """Material velocity, and −ḣ/|∇h| along m."""
         rows, face = self.face(row, active)

@@ -79,6 +79,10 @@ class EdgeTable:
         """Points of the sheets that end at the edges."""
         return self.ask(sight.at.row, lambda kind, row, own: kind.body(row, sight, own))
 
+    def lies_in(self, sight: Sight) -> mi.Normal3f:
+        """Unit normals of the flat faces on which the edges lie; 0 where they lie on none."""
+        return self.ask(sight.at.row, lambda kind, row, own: kind.lies_in(row, sight, own))
+
     def face_along(self, row: mi.UInt32, ω: mi.Vector3f) -> mi.Normal3f:
         """Unit normals of the faces at the edges that are most nearly in line with ω; 0 where there are none."""
         return self.ask(row, lambda kind, own_row, own: kind.face_along(own_row, ω, own))
