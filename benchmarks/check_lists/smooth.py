@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 
 import mitsuba as mi
@@ -91,24 +92,16 @@ MATERIALS: dict[str, tuple[dict, tuple[int, ...]]] = {
 }
 
 
-def lamps_on(material: str) -> dict:
-    return {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
-
-
-def is_rough(material: str) -> bool:
-    return material.startswith("rough")
-
-
-def sky_over(material: str) -> dict:
-    return uneven_sky() if is_rough(material) else SKY
-
-
 def smooth_scene(
     mesh: str, plugin: dict, depth: int, camera: Callable[[], dict], lights: Callable[[], dict]
 ) -> mi.Scene:
     points, faces = MESHES[mesh]()
     shape = meshes.smooth_mesh("shape", points, faces, mi.load_dict(plugin))
     return scene_of(depth, camera(), shape=shape, floor=ground(-1.3), **lights())
+
+
+def lamps_on(material: str) -> dict:
+    return {} if material == "light" else {"lamp": lamp(*LAMP), "point": POINT}
 
 
 def uneven_sky() -> dict:
@@ -120,25 +113,38 @@ def uneven_sky() -> dict:
     return {"sky": sky(np.repeat(radiance[..., None], 3, -1))}
 
 
+@dataclass(frozen=True)
+class Look:
+    """What moves, and how it is looked at."""
+
+    motion: Motion
+    camera: Callable[[], dict]
+    lights: Callable[[], dict]
+    plugin: dict  # what the body is made of
+
+
 def smooth() -> Iterator[Listed]:
-    positions = "shape.vertex_positions"
-    whole = partial(view, EYE, TARGET)
     for mesh, make in MESHES.items():
-        points, faces = make()
-        motions = {
-            "moved": (moved(positions, eps=STEP), whole),
-            "turned": (swung(points), whole),
-            "vertex": one_vertex(points, faces),
-            "camera": (moved("camera.to_world", eps=STEP), whole),
-        }
-        closely = {**motions, "vertex": one_rough_vertex(points, faces)}
         for material, (plugin, depths) in MATERIALS.items():
-            for how, (motion, camera) in (closely if is_rough(material) else motions).items():
-                lights = partial(sky_over if how == "vertex" else lamps_on, material)
-                shown = plugin | (EXACTLY_SAMPLED if how == "vertex" and is_rough(material) else {})
+            for how, look in looks(*make(), material, plugin).items():
                 for depth in depths:
-                    scene = partial(smooth_scene, mesh, shown, depth, camera, lights)
-                    yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, motion, 0.01, 0.004)
+                    scene = partial(smooth_scene, mesh, look.plugin, depth, look.camera, look.lights)
+                    yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, look.motion, 0.01, 0.004)
+
+
+def looks(points: np.ndarray, faces: np.ndarray, material: str, plugin: dict) -> dict[str, Look]:
+    """By motion. `plugin`: of the material."""
+    positions = "shape.vertex_positions"
+    whole = {
+        "moved": moved(positions, eps=STEP),
+        "turned": swung(points),
+        "camera": moved("camera.to_world", eps=STEP),
+    }
+    camera, lights = partial(view, EYE, TARGET), partial(lamps_on, material)
+    found = {how: Look(motion, camera, lights, plugin) for how, motion in whole.items()}
+    if material.startswith("rough"):
+        return {**found, "vertex": Look(*one_rough_vertex(points, faces), uneven_sky, plugin | EXACTLY_SAMPLED)}
+    return {**found, "vertex": Look(*one_vertex(points, faces), lambda: SKY, plugin)}
 
 
 def swung(points: np.ndarray) -> Motion:

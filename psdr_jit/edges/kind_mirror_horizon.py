@@ -31,7 +31,7 @@ import mitsuba as mi
 
 from .kind import Use
 from .kind_within_faces import CurvesWithinFaces
-from .shading_curve import ALTERNATIONS, CurvePoint, Face
+from .shading_curve import ALTERNATIONS, CurvePoint, Face, LoneCorner
 
 #: Halvings of an interval in r: as far as float32 tells its ends apart.
 HALVINGS = 24
@@ -99,14 +99,8 @@ class MirroredFace(Face):
         N = [mi.Vector3f(corner) for corner in self.n]
         c = dr.dot(n, D[0])
         up = [dr.squared_norm(N[k]) * c > 2 * dr.dot(n, N[k]) * dr.dot(N[k], D[k]) for k in range(3)]
-        alone = [(up[k] != up[(k + 1) % 3]) & (up[k] != up[(k + 2) % 3]) for k in range(3)]
-
-        def turned(values: list, k: int):
-            """Entry k after the lone corner."""
-            first, second = values[(1 + k) % 3], values[(2 + k) % 3]
-            return dr.select(alone[1], first, dr.select(alone[2], second, values[k % 3]))
-
-        D, N, p = ([mi.Vector3f(turned(v, k)) for k in range(3)] for v in (D, N, self.p))
+        corner = LoneCorner.of(up)
+        D, N, p = (corner.first(values) for values in (D, N, self.p))
         across, along = p[2] - p[1], p[1] + s * (p[2] - p[1]) - p[0]
         N0, N1, D0, D1 = N[0], N[1] + s * (N[2] - N[1]) - N[0], D[0], w * along
         z = dr.dot(N0, D0), dr.dot(N0, D1) + dr.dot(N1, D0), dr.dot(N1, D1)
@@ -117,12 +111,9 @@ class MirroredFace(Face):
         r, count = _root(g, s)
         towards = D0 + r * D1
         slope = dr.abs(g[1] + r * (2 * g[2] + 3 * r * g[3]))
-        weights = [1 - r, r * (1 - s), r * s]  # of the corners, the lone one first
-        b1 = dr.select(alone[1], weights[0], dr.select(alone[2], weights[2], weights[1]))
-        b2 = dr.select(alone[1], weights[1], dr.select(alone[2], weights[0], weights[2]))
         distance = dr.norm(towards)
         weight = count * dr.norm(dr.cross(r * across, along)) * distance / slope
-        return CurvePoint(mi.Point2f(b1, b2), towards / distance, weight, (count > 0) & (slope > 0))
+        return CurvePoint(corner.at(s, r), towards / distance, weight, (count > 0) & (slope > 0))
 
 
 def _root(g: tuple, s: mi.Float) -> tuple[mi.Float, mi.Float]:

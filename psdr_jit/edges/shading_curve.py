@@ -25,6 +25,33 @@ class CurvePoint:
 
 
 @dataclass
+class LoneCorner:
+    """The corner of a triangle that lies alone on its side of a curve; the first where none does."""
+
+    second: mi.Bool
+    third: mi.Bool
+
+    @staticmethod
+    def of(side: list[mi.Bool]) -> LoneCorner:
+        """`side`: on which one each corner lies."""
+        return LoneCorner(*((side[k] != side[k - 1]) & (side[k] != side[k - 2]) for k in (1, 2)))
+
+    def first(self, values: list) -> list[mi.Vector3f]:
+        """What belongs to the corners, the lone one first, as they follow each other."""
+        after = [[values[(i + k) % 3] for k in range(3)] for i in range(3)]
+        return [
+            mi.Vector3f(dr.select(self.second, b, dr.select(self.third, c, a))) for a, b, c in zip(*after, strict=True)
+        ]
+
+    def at(self, s: mi.Float, r: mi.Float) -> mi.Point2f:
+        """The share r of the way from it to the point s of the opposite side."""
+        lone, next_, last = 1 - r, r * (1 - s), r * s
+        b1 = dr.select(self.second, lone, dr.select(self.third, last, next_))
+        b2 = dr.select(self.second, next_, dr.select(self.third, lone, last))
+        return mi.Point2f(b1, b2)
+
+
+@dataclass
 class Face:
     """A triangle and the normals at its corners. Barycentric (b1, b2) as Mitsuba's `prim_uv`."""
 
@@ -108,18 +135,9 @@ class Face:
         Where no corner is alone, or that way crosses the curve twice, each of both points takes every other of many
         small intervals of s, and counts twice.
         """
-        g = self._heights(view)
-        positive = [value > 0 for value in g]
-        alone = [(positive[k] != positive[(k + 1) % 3]) & (positive[k] != positive[(k + 2) % 3]) for k in range(3)]
-
-        def turned(values: list, k: int):
-            """Entry k after the lone corner."""
-            first, second = values[(1 + k) % 3], values[(2 + k) % 3]
-            return dr.select(alone[1], first, dr.select(alone[2], second, values[k % 3]))
-
+        corner = LoneCorner.of([height > 0 for height in self._heights(view)])
         eye, w = mi.Vector3f(view.x, view.y, view.z), view.w
-        p = [mi.Vector3f(turned(self.p, k)) for k in range(3)]
-        n = [mi.Vector3f(turned(self.n, k)) for k in range(3)]
+        p, n = corner.first(self.p), corner.first(self.n)
         end, n_end = p[1] + s * (p[2] - p[1]), n[1] + s * (n[2] - n[1])
         # (1 − r)² c0 + r (1 − r) c1 + r² c2
         c0, c2 = dr.dot(n[0], eye - w * p[0]), dr.dot(n_end, eye - w * end)
@@ -140,11 +158,8 @@ class Face:
         distance = dr.norm(along)
         slope = dr.abs(2 * square * r + linear)
         area = dr.norm(dr.cross(r * (p[2] - p[1]), end - p[0]))
-        weights = [1 - r, r * (1 - s), r * s]  # of the corners, the lone one first
-        b1 = dr.select(alone[1], weights[0], dr.select(alone[2], weights[2], weights[1]))
-        b2 = dr.select(alone[1], weights[1], dr.select(alone[2], weights[0], weights[2]))
         return CurvePoint(
-            mi.Point2f(b1, b2),
+            corner.at(s, r),
             -along / distance,
             area * distance / slope * dr.select(both, 2.0, 1.0),
             (in1 | in2) & (under_root >= 0) & (slope > 0),
