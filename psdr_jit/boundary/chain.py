@@ -19,7 +19,7 @@ Behind the first vertex any segment may step: what a mirror shows, the shadow on
 light that stays on its material), what its surfaces see of others (directions that stay what they are). Between smooth
 vertices that is the spatial form with its directions and points of light drawn beforehand (`chain_fixed`). Seen are
 outlines, creases, curves along which surfaces cut (both sides a little off them, `chain_beside`), shading
-outlines and patterns. Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments, and the steps that
+outlines and patterns. Left out is what lies behind more than `chain_world.CHAIN_DEPTH` segments, and the steps that
 lights bring along. With light subpaths, what points send to the film by way of mirrors and glass steps as well, and is
 searched from the light's side (`light_chain`).
 """
@@ -54,7 +54,8 @@ from .chain_lines import Lines
 from .chain_outline import Curve
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
-from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
+from .chain_trace import ChainRecords, Pair
+from .chain_world import CHAIN_DEPTH
 
 NAME = "chain"
 
@@ -126,7 +127,9 @@ def _radiances(job: Job, pair: Pair, wavelengths) -> mi.Spectrum:
     pi = hit.intersection()
     emits = of.emits | is_followed(job, pi.shape.emitter(), pi.is_valid())
     L, _, _ = walk(job.scene, rng, ray, pi, limits, NoSink(), emits, ~of.in_light)
-    step = dr.block_reduce(dr.ReduceOp.Add, dr.select(second, -L, L) * β / WALKS, 2 * WALKS)
+    of_walk = dr.select(second, -L, L) * β / WALKS
+    dr.eval(of_walk)  # of each channel by itself, the walks would be taken again
+    step = dr.block_reduce(dr.ReduceOp.Add, of_walk, 2 * WALKS)
     return job.call.counters.rejected.keep_finite(step)
 
 

@@ -18,7 +18,8 @@ from ..paths.rays import ROUNDING
 from ..paths.surface_at import surface_of
 from .chain_outline import Curve, edge_outline, triangle
 from .chain_patterns import INSET
-from .chain_trace import ChainWorld, Pair
+from .chain_trace import Pair
+from .chain_world import ChainWorld
 
 #: How far inside of an edge its face is looked at, in units of rounding.
 INSIDE = 4.0

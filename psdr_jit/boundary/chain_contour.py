@@ -23,7 +23,7 @@ from ..core.records import Hit
 from ..core.tube_axis import Axis
 from ..edges.copy_table import number_of
 from ..scene.surfaces import Splines
-from .chain_trace import ChainWorld
+from .chain_world import ChainWorld
 
 #: Largest |n·d| at a hit next to a contour.
 GRAZING = 0.35

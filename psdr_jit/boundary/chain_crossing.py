@@ -19,7 +19,8 @@ from ..paths.surface_at import surface_of
 from .chain_outline import Curve, crossed_curve
 from .chain_patterns import NO_FAMILY
 from .chain_sweeps import AtRest, slope_at_end
-from .chain_trace import ChainRecords, ChainWorld, Pair
+from .chain_trace import ChainRecords, Pair
+from .chain_world import ChainWorld
 from .searched_lines import SearchedLines
 
 #: Largest distance on the film from a crossing to the curve that it is thought to belong to [px, or cells]: halving

@@ -8,41 +8,45 @@ import mitsuba as mi
 from ..core.varying import varying
 from .chain_intervals import Crossing, Interval
 
-#: Most crossings that a search finds in one kernel, and most intervals that it comes back to.
-SLOTS = 8
+#: Most crossings that a search finds in one kernel, and most intervals that it comes back to; where there are many.
+SLOTS, MANY_SLOTS = 8, 2
 
 
 class Finds:
-    """Crossings of `lanes` searches, up to `slots` each, with what lies in front of each. Not a PyTree."""
+    """What the searches of a queue find, with what they leave for later. Not a PyTree."""
 
-    def __init__(self, lanes: int, slots: int):
-        self.stride, self.lane = varying(mi.UInt32, lanes), dr.arange(mi.UInt32, lanes)
-        self.slots = varying(mi.UInt32, slots)
-        n = lanes * slots
+    def __init__(self, queue, many: bool):
+        size, slots = dr.width(queue.at.sample), MANY_SLOTS if many else SLOTS
+        self.stride, self.slots = varying(mi.UInt32, size), varying(mi.UInt32, slots)
+        n = size * slots
         self.crossing = Crossing(Interval.made(dr.zeros, n), dr.zeros(mi.UInt32, n))
         self.before = Interval.made(dr.zeros, n)
         self.found, self.goes_on = dr.zeros(mi.Bool, n), dr.zeros(mi.Bool, n)
-        dr.make_opaque(self.crossing, self.before, self.found, self.goes_on)
+        self.rest = dr.zeros(type(queue), size)
+        self.segments = dr.zeros(mi.UInt32, size)
+        dr.make_opaque(self.arrays)
 
-    def write(self, slot: mi.UInt32, kept: mi.Bool, crossing: Crossing, active: mi.Bool) -> None:
+    @property
+    def arrays(self):
+        return [self.crossing, self.before, self.found, self.goes_on, self.rest, self.segments]
+
+    def write(self, task: mi.UInt32, slot: mi.UInt32, kept: mi.Bool, crossing: Crossing, active: mi.Bool) -> None:
         """A crossing, and whether it is kept."""
-        active = active & (slot < self.slots)
-        self._scatter(slot, ((self.crossing, crossing), (self.found, kept)), active)
+        self._scatter(task, slot, ((self.crossing, crossing), (self.found, kept)), active & (slot < self.slots))
 
-    def write_front(self, slot: mi.UInt32, front: Interval, active: mi.Bool) -> None:
-        """An interval in front of a crossing that a later kernel goes on with."""
-        active = active & (slot < self.slots)
-        self._scatter(slot, ((self.before, front), (self.goes_on, mi.Bool(True))), active)
-
-    def _scatter(self, slot: mi.UInt32, pairs: tuple, active: mi.Bool) -> None:
-        for buffer, value in pairs:
-            dr.scatter(buffer, value, slot * self.stride + self.lane, active, mode=dr.ReduceMode.Permute)
-
-    def write_rest(self, stack: Stack, height: mi.UInt32, sample: mi.UInt32) -> None:
-        """What searches of the lines `sample` that pause have not come back to."""
+    def leave(self, task: mi.UInt32, rest, stack: Stack, height: mi.UInt32, segments: mi.UInt32, done: mi.Bool) -> None:
+        """How far a search has come, and what it has not come back to."""
+        dr.scatter(self.rest, rest, task, done, mode=dr.ReduceMode.Permute)
+        dr.scatter(self.segments, segments, task, done, mode=dr.ReduceMode.Permute)
         for i in range(SLOTS):
             number = mi.UInt32(i)
-            self.write_front(number, read(stack, number, sample), number < height)
+            waits = done & (number < dr.minimum(height, self.slots))
+            front = read(stack, number, rest.at.sample)
+            self._scatter(task, number, ((self.before, front), (self.goes_on, mi.Bool(True))), waits)
+
+    def _scatter(self, task: mi.UInt32, slot: mi.UInt32, pairs: tuple, active: mi.Bool) -> None:
+        for buffer, value in pairs:
+            dr.scatter(buffer, value, slot * self.stride + task, active, mode=dr.ReduceMode.Permute)
 
 
 #: A stack of intervals: bounds, weight and whether they are fresh; key. One place more than it holds takes what is

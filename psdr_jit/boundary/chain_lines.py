@@ -18,7 +18,8 @@ from ..paths.rays import skip_emitters
 from ..plan.job import Job
 from .chain_aims import ChainAims
 from .chain_fixed import Directions
-from .chain_trace import ChainWorld
+from .chain_trace import compare_light
+from .chain_world import ChainWorld
 from .searched_lines import SearchedLines, either
 
 #: Intervals as short as this [px] are not cut: what is narrower, such as the last bit of a tip, is not looked for.
@@ -57,7 +58,7 @@ class Lines(SearchedLines):
 
     @staticmethod
     def of(job: Job) -> Lines:
-        world = ChainWorld.of(job)
+        world = ChainWorld.of(job, compare_light)
         if world.scatters:
             world = replace(world, aims=ChainAims.of(job))
         samples = FilmSamples.over(job.film, job.spp, job.density)

@@ -37,7 +37,8 @@ from ..scene.poses import Poses
 from .chain_contour import Outline, contour, resting
 from .chain_patterns import NO_FAMILY
 from .chain_surface import ONE_SHADING
-from .chain_trace import ChainWorld, Pair
+from .chain_trace import Pair
+from .chain_world import ChainWorld
 
 #: Difference of distances, relative to them, up to which two surfaces may touch there.
 TOUCHING = 1e-3

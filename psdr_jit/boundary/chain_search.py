@@ -8,8 +8,9 @@ Of most crossings can be told roughly where they are (`chain_guess`): halving th
 on the one side and on the other.
 
 As at most one part goes on, a lane of a kernel follows it, and past a crossing what lies behind; then it comes back to
-what lies in front. While there are many searches that waits for the next kernel instead, and so do intervals that take
-longer than others.
+what lies in front. Some searches take a hundred times as long as most: lanes that are done take up the next of the
+queue, so that all of those that go on side by side have something to do. (One search for each lane, sorted and begun
+anew after a while: of 16 lanes 4 to 8 had.)
 
 Steps of what cannot move are walked around in wide bends: what they leave over counts with the part in front. Crossings
 of segments before `lines.first_kept` are not kept either: of camera rays, those of the first segment belong to the
@@ -26,7 +27,7 @@ import mitsuba as mi
 from ..core.compaction import compact
 from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
-from .chain_finds import SLOTS, Finds, empty_stack, push, read
+from .chain_finds import Finds, empty_stack, push, read
 from .chain_guess import Guesses
 from .chain_intervals import BEHIND, FRONT, Crossing, Interval
 from .chain_lamps import NEAR
@@ -42,14 +43,11 @@ BESIDE = 2.0**-5
 #: How far from the middle of an interval, in shares of its width, a lamp is looked for: at the ends there is none.
 WITHIN = 0.5 - 2.0**-4
 
-#: Looks at an interval and its halves in the first kernel; each further one has twice as many.
-FIRST_LOOKS = 2
+#: Where there are more searches than this, there is less room for what each of them finds in one kernel.
+FEW = 16384
 
-#: As few searches as this are followed to their ends, however long, and back to what lies in front of crossings; but no
-#: more crossings than SLOTS in one kernel. Where there are more, a search pauses before it halves: it then finds one at
-#: most.
-FEW, UNLIMITED = 16384, 2**31
-
+#: Lanes of a kernel: for each thread of a processor, and on a GPU.
+LANES_OF_THREAD, LANES_OF_GPU = 256, 2**18
 
 #: What a search does next: compare the ends of the whole interval, or a place inside with the near end; halve what is
 #: between lo and hi, check what halving came to; or nothing.
@@ -106,22 +104,18 @@ def begun(at: Interval) -> mi.UInt32:
 
 
 @dr.syntax
-def _searched(
-    lines: SearchedLines, guesses: Guesses, search: Search, pause: tuple[mi.UInt32, mi.Bool], finds: Finds
-) -> tuple[Search, mi.UInt32]:
-    """Go on with searches until they pause or end, `(searches, segments traced by each)`; fills `finds`.
+def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds) -> None:
+    """Go on with the searches of a `queue` until they end, or have found as much as `finds` holds; fills it.
 
-    `pause`: the number of looks after which one does, and whether one does before it begins to halve; it then does not
-    come back to what lies in front of crossings, either.
+    Lanes that are done with a search take up the next one of the queue.
     """
-    most_looks, before_halving = pause
-    stack, height = empty_stack(), mi.UInt32(0)
+    waiting, task = varying(mi.UInt32, _width(queue)), dr.arange(mi.UInt32, min(_width(queue), _lanes()))
+    taken, stack, height = varying(mi.UInt32, dr.width(task)), empty_stack(), mi.UInt32(0)
     least, narrowest = lines.least_width, lines.narrowest
-    search = dr.select(mi.Bool(True), search, search)
-    looks, slot, segments, active = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0), search.mode != END
-    while dr.hint(
-        active, label="psdr.chain.search", exclude=[lines, guesses, finds, most_looks, before_halving, least]
-    ):
+    active = task < waiting
+    search = dr.gather(Search, queue, task, active)
+    slot, segments = mi.UInt32(0), mi.UInt32(0)
+    while dr.hint(active, label="psdr.chain.search", exclude=[lines, guesses, queue, finds, waiting, taken, least]):
         at, whole, halve = search.at, search.mode <= PROBE, search.mode == HALVE
         start, end = search.compared(least)
         pair = lines.compare(at.sample, (start, end))
@@ -134,14 +128,13 @@ def _searched(
         lo = dr.select(apart, start, dr.select(halve & ~first, end, search.lo))
         moves = dr.select(apart | first | checked, pair.moves, search.moves)
         again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
-        crossed = checked & pair.differs & ~again
+        crossed = active & checked & pair.differs & ~again
 
         found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh, at.uneven), pair.k)
-        finds.write(slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
+        finds.write(task, slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
         front = at.part(at.lo, dr.select(moves, lo, hi), FRONT, pair.chosen, ~moves)
         kept, part = front.kept(mi.Bool(True), mi.Bool(False), narrowest)
-        finds.write_front(slot, part, crossed & kept & before_halving)
-        height = push(stack, height, part, crossed & kept & ~before_halving)
+        height = push(stack, height, part, crossed & kept)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         kept, part, place = search.looked_into(pair, (start, end), narrowest)
@@ -158,11 +151,20 @@ def _searched(
         guess = dr.select(apart | first, guesses.place(pair, start, end, apart | first), search.guess)
         guess = dr.select(mode == PROBE, dr.select(returns, at.middle(), place), guess)
         search = Search(at, mode, lo, hi, moves, guess)
-        looks += dr.select(whole, mi.UInt32(1), 0)
-        waits = (looks >= most_looks) | (slot == finds.slots)
-        active = (mode != END) & ~(((mode <= PROBE) & waits) | (apart & before_halving))
-    finds.write_rest(stack, height, search.at.sample)
-    return search, segments
+
+        done = active & ((mode == END) | ((mode <= PROBE) & (slot == finds.slots)))
+        finds.leave(task, search, stack, height, segments, done)
+        next_ = dr.scatter_inc(taken, mi.UInt32(0), done)
+        task = dr.select(done, next_, task)
+        active &= task < waiting
+        search = dr.select(done, dr.gather(Search, queue, task, done & active), search)
+        slot, segments, height = (dr.select(done, 0, number) for number in (slot, segments, height))
+
+
+def _lanes() -> int:
+    """How many searches go on at a time."""
+    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+    return dr.thread_count() * LANES_OF_THREAD if on_cpu else LANES_OF_GPU
 
 
 def _joined(parts: list) -> Search | Crossing | None:
@@ -203,22 +205,16 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     sample = dr.arange(mi.UInt32, n)
     key = mi.sample_tea_32(stream_seed(lines.job.seed, Stream.CHAIN_CUTS), sample)[0]
     left = Search.begin(Interval.whole(sample, key))
-    found, looks = [], FIRST_LOOKS
+    found = []
     smooth = any(shape.smooth for shape in lines.job.facts.shapes)
     guesses = Guesses(lines.analytic, lines.copies, lines.job.surfaces, smooth)
     while left is not None:
         left = _stored(left)
-        many = _width(left) > FEW
-        finds = Finds(_width(left), 1 if many else SLOTS)
-        pause = varying(mi.UInt32, looks if many else UNLIMITED), varying(mi.Bool, many)
-        search, segments = _searched(lines, guesses, left, pause, finds)
-        dr.eval(search, segments, finds.crossing, finds.before, finds.found, finds.goes_on)
-        lines.tell_effort(left.at.sample, segments)
+        finds = Finds(left, _width(left) > FEW)
+        _search(lines, guesses, left, finds)
+        dr.eval(finds.arrays)
+        lines.tell_effort(left.at.sample, finds.segments)
         found.append(compact(finds.crossing, finds.found))
         before = compact(finds.before, finds.goes_on)
-        halving = (search.mode == HALVE) | (search.mode == CHECK)
-        # Those that halve, which takes long, side by side.
-        parts = [compact(search, halving), compact(search, search.mode <= PROBE)]
-        left = _joined([*parts, None if before is None else Search.begin(before)])
-        looks *= 2
+        left = _joined([compact(finds.rest, finds.rest.mode != END), None if before is None else Search.begin(before)])
     return _joined(found)

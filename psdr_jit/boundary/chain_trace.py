@@ -11,84 +11,19 @@ On the way, lamps are looked out for that may hide between the two (`chain_lamps
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core.records import Hit
-from ..core.surface_code import top_level, top_level_of
 from ..core.varying import varying
-from ..edges.followed_lights import FollowedLights, followed_lights
 from ..paths.surface_at import surface_at
-from ..plan.job import Job
-from ..scene.registry import registry_table
-from ..scene.surfaces import Surfaces
-from .chain_aims import ChainAims
 from .chain_fixed import Directions, LightPoint, draw_direction, draw_light
-from .chain_lamps import ChainLamps
 from .chain_lobes import Leaving, LobeNumber, has_delta, leave, lobes_part, smooth_choice
-from .chain_patterns import NO_FAMILY, ChainPatterns
-from .chain_surface import NOWHERE, ChainSurfaces, goes_under
-
-#: Kinds of shapes that have neither triangles nor a pose.
-ROUNDED = ("curve", "grid", "ellipsoids")
-
-#: Segments of a chain that are looked at; what is seen at the end of longer ones has no edges.
-CHAIN_DEPTH = 8
-
-
-@dataclass(frozen=True)
-class ChainWorld:
-    """What chains are traced in. Host object."""
-
-    scene: mi.Scene
-    tables: Surfaces | None  # what Mitsuba does not evaluate of it
-    depth: int  # largest number of segments
-    surfaces: ChainSurfaces
-    patterns: ChainPatterns | None  # None: no surface steps inside
-    moving: mi.UInt32  # by registry index of a shape or an instance: 1 if steps may move because of it
-    camera: mi.Bool  # may they because the camera does, ...
-    lights: mi.Bool  # ... or because lights do?
-    connects: Callable[..., Pair]  # smooth vertices to the other end, as `compare_light` does
-    scatters: bool  # are there such vertices at all?
-    mode: mi.TransportMode  # of what is carried from there: radiance, or importance
-    followed: FollowedLights | None = None  # lights that chains meet, and that have no points of light
-    lamps: ChainLamps | None = None  # that may hide between two chains
-    has_contours: bool = False  # are there bodies whose ends `chain_contour` knows?
-    aims: ChainAims | None = None  # what directions from smooth vertices are aimed at
-
-    @staticmethod
-    def of(job: Job) -> ChainWorld:
-        facts = job.facts
-        changing = {s.index for s in facts.shapes if s.geometry or s.shading or s.material}
-        lights = facts.emitters_move or any(s.is_emitter and s.index in changing for s in facts.shapes)
-        depth = min(job.limits.max_depth, CHAIN_DEPTH)
-        return ChainWorld(
-            scene=job.scene,
-            tables=job.surfaces,
-            depth=depth,
-            surfaces=ChainSurfaces.of(job),
-            patterns=ChainPatterns.of(job),
-            moving=registry_table(job.scene, changing),
-            camera=varying(mi.Bool, facts.view_moves),
-            lights=varying(mi.Bool, lights),
-            connects=compare_light,
-            scatters=facts.scatters,
-            mode=mi.TransportMode.Radiance,
-            followed=followed_lights(job),
-            lamps=ChainLamps.of(job),
-            has_contours=any(s.kind in ROUNDED for s in facts.shapes),
-        )
-
-    def moves(self, *surfaces: mi.SurfaceInteraction3f | Hit) -> mi.Bool:
-        """May a step move because of what was met there?"""
-        found = mi.UInt32(0)
-        for met in surfaces:
-            index = top_level_of(met.shape) if isinstance(met, Hit) else top_level(met)
-            found |= dr.gather(mi.UInt32, self.moving, index)
-        return found != 0
+from .chain_patterns import NO_FAMILY
+from .chain_surface import NOWHERE, goes_under
+from .chain_world import ChainWorld
 
 
 @dataclass
@@ -226,10 +161,8 @@ def trace_pair(
             pair.differs |= crossed
             pair.family, pair.where = dr.select(active, family, pair.family), dr.select(guessed, where, pair.where)
         if dr.hint(world.lamps is not None, mode="scalar"):
-            share, miss = world.lamps.between(line, (ray_a, a), (ray_b, b))
-            nearer = active & pair.emits & (pair.k > 0) & (miss < pair.miss)
-            pair.lamp = dr.select(nearer, share, pair.lamp)
-            pair.miss = dr.select(nearer, miss, pair.miss)
+            pair = look_for_lamps(world, pair, line, ((ray_a, a), (ray_b, b)), active)
+        pair.differs &= world.differ(a, b, pair.k)
         pair.specular |= (a.is_valid() & has_delta(a.bsdf())) | (b.is_valid() & has_delta(b.bsdf()))
         pair.moves |= world.moves(a, b)
         u = Numbers.draw(rng)
@@ -248,7 +181,7 @@ def trace_pair(
         lobe_a, lobe_b = lobe_a.behind(on_a, active), lobe_b.behind(on_b, active)
         if dr.hint(store is not None, mode="scalar"):
             store.write_bend(pair.k, on_a.by_delta, active)
-        active = on_a.alive & on_b.alive & ~pair.chosen
+        active = on_a.alive & on_b.alive & ~pair.chosen & world.goes_on(pair.k, on_a.by_delta)
         if dr.hint(world.surfaces.horizons, mode="scalar"):
             pair = leave_to(pair, (a, b), (on_a, on_b), active)
         pair.k += dr.select(active, mi.UInt32(1), 0)
@@ -258,6 +191,13 @@ def trace_pair(
         ray_a, ray_b = on_a.ray, on_b.ray
     pair.moves |= world.camera | pair.chosen
     return pair
+
+
+def look_for_lamps(world: ChainWorld, pair: Pair, line: mi.UInt32, ends: tuple, active: mi.Bool) -> Pair:
+    """May a lamp hide between the chains' segments, nearer to them than what has been found so far?"""
+    share, miss = world.lamps.between(line, *ends)
+    nearer = active & pair.emits & (pair.k > 0) & (miss < pair.miss)
+    return replace(pair, lamp=dr.select(nearer, share, pair.lamp), miss=dr.select(nearer, miss, pair.miss))
 
 
 def compare_light(world: ChainWorld, pair: Pair, ends: tuple, u: Numbers, active: mi.Bool) -> Pair:

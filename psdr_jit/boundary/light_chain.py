@@ -22,7 +22,7 @@ they share y_1, hence the flow. At the first they do not: each side then has the
 For the surface that ends in the edge itself, F_θ = 0: its material does not pass its own border. What is left is the
 other side, light that something comes in between of, or no longer does.
 
-Left out is what lies behind more than `chain_trace.CHAIN_DEPTH` segments. Where glass or a mirror cuts into what it
+Left out is what lies behind more than `chain_world.CHAIN_DEPTH` segments. Where glass or a mirror cuts into what it
 shines on, both sides are looked at a little off the cut (`chain_beside`).
 """
 
@@ -53,7 +53,8 @@ from .chain_fixed import Directions
 from .chain_outline import Curve
 from .chain_search import find_crossings
 from .chain_sweeps import adjoints_at_start, slope_at_end
-from .chain_trace import CHAIN_DEPTH, ChainRecords, Pair
+from .chain_trace import ChainRecords, Pair
+from .chain_world import CHAIN_DEPTH
 from .light_chain_lines import LightCells, LightLine, LightLines, sensor_view
 
 #: Memory of one line, as in `chain`.

@@ -43,7 +43,8 @@ from ..plan.job import Job
 from ..sampling.distribution import EdgeDistribution, edge_distribution, pmf, sample_edge
 from .chain_fixed import Directions, LightPoint
 from .chain_lines import LEAST_WIDTH
-from .chain_trace import CHAIN_DEPTH, ChainWorld, Numbers, Pair
+from .chain_trace import Numbers, Pair
+from .chain_world import CHAIN_DEPTH, ChainWorld, Last
 from .searched_lines import SearchedLines, either
 
 #: Cells along one side of the square.
@@ -126,14 +127,14 @@ def sensor_world(job: Job, technique: LightTechnique) -> ChainWorld:
 
     The line of sight of the sensor, behind y_longest, is a segment as well.
     """
-    world = ChainWorld.of(job)
+    world = ChainWorld.of(job, partial(compare_sensor, technique, job.options.hide_emitters))
     return replace(
         world,
         depth=min(technique.longest + 1, CHAIN_DEPTH),
+        last=Last.NOTHING if technique.longest < CHAIN_DEPTH else Last.ALL,
         surfaces=replace(world.surfaces, folds=world.surfaces.horizons),
         camera=varying(mi.Bool, job.facts.emitters_move),
         lights=varying(mi.Bool, job.facts.camera_moves),
-        connects=partial(compare_sensor, technique, job.options.hide_emitters),
         mode=mi.TransportMode.Importance,
         lamps=None,
     )

@@ -18,7 +18,8 @@ from ..edges.copy_table import CopyTable
 from ..plan.job import Job
 from .chain_fixed import Directions
 from .chain_outline import AnalyticShapes
-from .chain_trace import ChainRecords, ChainWorld, Pair, guide, trace_pair
+from .chain_trace import ChainRecords, Pair, guide, trace_pair
+from .chain_world import ChainWorld
 
 
 def either(u: mi.Float) -> tuple[mi.Bool, mi.Float]:

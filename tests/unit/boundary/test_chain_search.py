@@ -17,6 +17,9 @@ LINES = 40_000
 #: Of awkward lines: where a step that cannot move lies, and how far apart chains are taken to differ.
 AT_REST, FAR = 0.37, 0.21
 
+#: Of a fence: twice as many crossings.
+STRIPES = 5
+
 
 class Striped:
     """Lines across one stripe each, from `start` to `start + width`. The family keeps guesses out.
@@ -85,6 +88,32 @@ def test_a_lamp_is_found_without_weight(llvm):
     assert np.mean(weights[:, 0] == 1) > 0.8
     assert abs(weights[:, 0].mean() - 1) < 4 * weights[:, 0].std() / LINES**0.5
     assert np.mean(weights[:, 0] == weights[:, 1]) > 0.99
+
+
+class Fence(Striped):
+    """Lines across `STRIPES` wide stripes."""
+
+    def compare(self, sample: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> Pair:
+        pair = super().compare(sample, ends)
+        start = dr.gather(mi.Float, self.start, sample)
+        number = [mi.Int32(dr.floor(2 * STRIPES * s + start)) for s in ends]
+        pair.differs = (number[0] & 1) != (number[1] & 1)
+        return pair
+
+
+@pytest.mark.parametrize("lines", [LINES, 300])
+def test_more_crossings_are_found_than_a_search_has_room_for(lines, llvm):
+    """Lanes take up search after search, and what is left of those that pause."""
+    start = np.random.default_rng(4).uniform(0.1, 0.9, lines)
+    found = find_crossings(Fence(start, 0.0, lamp=False, awkward=False)).at
+    sample, lo, weight = (np.array(v) for v in (found.sample, found.lo, found.weight))
+    number = np.rint(2 * STRIPES * lo + start[sample]).astype(int)
+    assert np.abs(2 * STRIPES * lo + start[sample] - number).max() < 0.01
+    weights = np.zeros((lines, 2 * STRIPES + 1))
+    np.add.at(weights, (sample, number), weight)
+    mean, error = weights[:, 1:].mean(0), weights[:, 1:].std(0) / lines**0.5
+    assert (weights[:, 1:] > 0).sum(1).max() > 8 and weights[:, 0].max() == 0
+    assert np.all(np.abs(mean - 1) < 5 * error)
 
 
 class Unlike(Striped):
