@@ -49,9 +49,9 @@ FEW = 16384
 #: Lanes of a kernel: for each thread of a processor, and on a GPU.
 LANES_OF_THREAD, LANES_OF_GPU = 256, 2**18
 
-#: What a search does next: compare the ends of the whole interval, or a place inside with the near end; halve what is
-#: between lo and hi, check what halving came to; or nothing.
-LOOK, PROBE, HALVE, CHECK, END = range(5)
+#: What a search does next: nothing; or compare the ends of the whole interval, or a place inside with the near end;
+#: halve what is between lo and hi, check what halving came to.
+END, LOOK, PROBE, HALVE, CHECK = range(5)
 
 
 @dataclass
@@ -112,8 +112,8 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
     waiting, task = varying(mi.UInt32, _width(queue)), dr.arange(mi.UInt32, min(_width(queue), _lanes()))
     taken, stack, height = varying(mi.UInt32, dr.width(task)), empty_stack(), mi.UInt32(0)
     least, narrowest = lines.least_width, lines.narrowest
-    active = task < waiting
-    search = dr.gather(Search, queue, task, active)
+    search = dr.gather(Search, queue, task)
+    active = search.mode != END
     slot, segments = mi.UInt32(0), mi.UInt32(0)
     while dr.hint(active, label="psdr.chain.search", exclude=[lines, guesses, queue, finds, waiting, taken, least]):
         at, whole, halve = search.at, search.mode <= PROBE, search.mode == HALVE

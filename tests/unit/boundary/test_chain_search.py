@@ -116,6 +116,18 @@ def test_more_crossings_are_found_than_a_search_has_room_for(lines, llvm):
     assert np.all(np.abs(mean - 1) < 5 * error)
 
 
+def test_a_search_that_is_alone_is_not_made_twice(llvm):
+    """Kernels for single lanes would be others: it has one beside it that has ended."""
+    for seed in range(60):
+        start = np.array([0.2 + 0.005 * seed])
+        lines = Striped(start, 0.3, lamp=False, awkward=False)
+        lines.job.seed = seed
+        found = find_crossings(lines)
+        if found is not None:
+            lo = np.sort(np.array(found.at.lo))
+            assert np.all(np.diff(lo) > 0.2), f"seed {seed}: {lo}"
+
+
 class Unlike(Striped):
     """Lines that end on a surface that is like nothing, itself included, as one whose normals are not numbers."""
 
