@@ -125,8 +125,9 @@ class Look:
 
 def smooth() -> Iterator[Listed]:
     for mesh, make in MESHES.items():
+        points, faces = make()
         for material, (plugin, depths) in MATERIALS.items():
-            for how, look in looks(*make(), material, plugin).items():
+            for how, look in looks(points, faces, material, plugin).items():
                 for depth in depths:
                     scene = partial(smooth_scene, mesh, look.plugin, depth, look.camera, look.lights)
                     yield Listed(NAME, f"{mesh}, {material}, {how}, depth {depth}", scene, look.motion, 0.01, 0.004)
@@ -134,9 +135,8 @@ def smooth() -> Iterator[Listed]:
 
 def looks(points: np.ndarray, faces: np.ndarray, material: str, plugin: dict) -> dict[str, Look]:
     """By motion. `plugin`: of the material."""
-    positions = "shape.vertex_positions"
     whole = {
-        "moved": moved(positions, eps=STEP),
+        "moved": moved("shape.vertex_positions", eps=STEP),
         "turned": swung(points),
         "camera": moved("camera.to_world", eps=STEP),
     }

@@ -8,15 +8,17 @@ import mitsuba as mi
 from ..core.varying import varying
 from .chain_intervals import Crossing, Interval
 
-#: Most crossings that a search finds in one kernel, and most intervals that it comes back to; where there are many.
-SLOTS, MANY_SLOTS = 8, 2
+#: Most crossings that a search finds in one kernel, and most intervals that it comes back to; and where there are more
+#: searches than FEW.
+SLOTS, MANY_SLOTS, FEW = 8, 2, 16384
 
 
 class Finds:
     """What the searches of a queue find, with what they leave for later. Not a PyTree."""
 
-    def __init__(self, queue, many: bool):
-        size, slots = dr.width(queue.at.sample), MANY_SLOTS if many else SLOTS
+    def __init__(self, queue):
+        size = dr.width(queue.at.sample)
+        slots = SLOTS if size <= FEW else MANY_SLOTS
         self.stride, self.slots = varying(mi.UInt32, size), varying(mi.UInt32, slots)
         n = size * slots
         self.crossing = Crossing(Interval.made(dr.zeros, n), dr.zeros(mi.UInt32, n))
@@ -27,12 +29,13 @@ class Finds:
         dr.make_opaque(self.arrays)
 
     @property
-    def arrays(self):
+    def arrays(self) -> list:
+        """What kernels fill."""
         return [self.crossing, self.before, self.found, self.goes_on, self.rest, self.segments]
 
     def write(self, task: mi.UInt32, slot: mi.UInt32, kept: mi.Bool, crossing: Crossing, active: mi.Bool) -> None:
         """A crossing, and whether it is kept."""
-        self._scatter(task, slot, ((self.crossing, crossing), (self.found, kept)), active & (slot < self.slots))
+        self._scatter(task, slot, ((self.crossing, crossing), (self.found, kept)), active)
 
     def leave(self, task: mi.UInt32, rest, stack: Stack, height: mi.UInt32, segments: mi.UInt32, done: mi.Bool) -> None:
         """How far a search has come, and what it has not come back to."""
@@ -40,11 +43,12 @@ class Finds:
         dr.scatter(self.segments, segments, task, done, mode=dr.ReduceMode.Permute)
         for i in range(SLOTS):
             number = mi.UInt32(i)
-            waits = done & (number < dr.minimum(height, self.slots))
             front = read(stack, number, rest.at.sample)
-            self._scatter(task, number, ((self.before, front), (self.goes_on, mi.Bool(True))), waits)
+            pairs = (self.before, front), (self.goes_on, mi.Bool(True))
+            self._scatter(task, number, pairs, done & (number < height))
 
     def _scatter(self, task: mi.UInt32, slot: mi.UInt32, pairs: tuple, active: mi.Bool) -> None:
+        active = active & (slot < self.slots)
         for buffer, value in pairs:
             dr.scatter(buffer, value, slot * self.stride + task, active, mode=dr.ReduceMode.Permute)
 

@@ -43,9 +43,6 @@ BESIDE = 2.0**-5
 #: How far from the middle of an interval, in shares of its width, a lamp is looked for: at the ends there is none.
 WITHIN = 0.5 - 2.0**-4
 
-#: Where there are more searches than this, there is less room for what each of them finds in one kernel.
-FEW = 16384
-
 #: Lanes of a kernel: for each thread of a processor, and on a GPU.
 LANES_OF_THREAD, LANES_OF_GPU = 256, 2**18
 
@@ -210,7 +207,7 @@ def find_crossings(lines: SearchedLines) -> Crossing | None:
     guesses = Guesses(lines.analytic, lines.copies, lines.job.surfaces, smooth)
     while left is not None:
         left = _stored(left)
-        finds = Finds(left, _width(left) > FEW)
+        finds = Finds(left)
         _search(lines, guesses, left, finds)
         dr.eval(finds.arrays)
         lines.tell_effort(left.at.sample, finds.segments)

@@ -172,7 +172,7 @@ class CurvesWithinFaces(EdgeKind):
 
     def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
         """Just above a face that is seen all but edge-on: what a line of sight along it meets is rounding."""
-        n = dr.normalize(self.face(row, active)[1].n_g)
+        n = self.lies_in(row, sight, active)
         towards = -dr.dot(n, sight.ω)
         above = dr.select(dr.abs(towards) < VISIBILITY_EPSILON, dr.sign(towards) * sight.offset, 0)
         return sight.at.x + above * n
