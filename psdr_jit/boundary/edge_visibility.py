@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -16,17 +16,23 @@ from ..paths.rays import ROUNDING, see_through_emitters
 from ..paths.surface_at import surface_at
 from ..plan.job import Job
 
+#: How far below what is seen from behind it is looked at a second time, in steps to the side.
+BELOW = 8
+
 
 def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool:
     """Is there anything between the viewer and the edges? Hidden emitters are transparent. Detached.
 
-    Flat faces are all met where they are. A ray that touches a ball may meet it anywhere about its outline: there the
-    last of the way is gone a second time, and so it is where the edge does not say on which side of a surface it lies.
+    What has a face around it is aimed at from just above, on the viewer's side: rays along a face, or to what is behind
+    an outline by rounding, may meet nothing at all. Flat faces are all met where they are. A ray that touches a ball
+    may meet it anywhere about its outline: there the last of the way is gone a second time, and so it is where the edge
+    does not say on which side of a surface it lies.
     """
-    aim, body = table.aim(sight), table.body(sight)
+    n = table.lies_in(sight)
+    above = -dr.sign(dr.dot(n, sight.ω)) * sight.offset * n
+    aim, body = table.aim(sight) + above, table.body(sight) + above
     ray = _between(sight.viewer, aim)
-    scale = ray.maxt + varying(mi.Float, job.facts.reach)
-    sheet = _Sheet(body, table.lies_in(sight), scale)
+    sheet = _Sheet(body, n, ray.maxt + varying(mi.Float, job.facts.reach))
     nearly = ray.maxt * (1 - VISIBILITY_EPSILON)
     if _faceted(job):
         blocked = _has_behind_it(job, ray, sheet, active)
@@ -34,7 +40,18 @@ def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool
     else:
         blocked = _meets(job, ray, nearly, active)
         unsure = mi.Bool(True)
-    return blocked | _has_behind_it(job, _between(ray(nearly), body), sheet, active & unsure & ~blocked)
+    blocked |= _has_behind_it(job, _between(ray(nearly), body), sheet, active & unsure & ~blocked)
+    return blocked | _seen_through_a_crack(job, sight, aim, sheet, BELOW * above, active & ~blocked)
+
+
+def _seen_through_a_crack(job: Job, sight: Sight, aim: mi.Point3f, sheet: _Sheet, below: mi.Vector3f, active: mi.Bool):
+    """Did rays to the back of a face slip through between two others? At an outline, where both are all but edge-on,
+    the gap that rounding leaves is as wide as much of what is hidden there. They are gone a second time, to a point
+    farther `below` the face.
+    """
+    from_behind = active & (dr.dot(sheet.n, sight.ω) > 0)
+    deeper = replace(sheet, body=sheet.body + below)
+    return _has_behind_it(job, _between(sight.viewer, aim + below), deeper, from_behind)
 
 
 def _faceted(job: Job) -> bool:

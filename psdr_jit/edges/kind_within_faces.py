@@ -29,7 +29,7 @@ from .film_cover import LENS_CENTRE, curve_cover
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Views
 from .lights import LightBounds
 from .location import EdgeLocation
-from .points import VISIBILITY_EPSILON, clearance, facing
+from .points import clearance, facing
 from .shading_curve import Face
 from .smooth_faces import FaceRows, SmoothFaces
 
@@ -169,13 +169,6 @@ class CurvesWithinFaces(EdgeKind):
         pi.shape = dr.gather(mi.ShapePtr, self.faces.shapes, rows.shape, active)
         pi.prim_uv = b + step
         return Side(mi.Ray3f(sight.viewer, sight.ω), pi, mi.Bool(False), own=mi.Bool(False), differs=mi.Bool(True))
-
-    def aim(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Point3f:
-        """Just above a face that is seen all but edge-on: what a line of sight along it meets is rounding."""
-        n = self.lies_in(row, sight, active)
-        towards = -dr.dot(n, sight.ω)
-        above = dr.select(dr.abs(towards) < VISIBILITY_EPSILON, dr.sign(towards) * sight.offset, 0)
-        return sight.at.x + above * n
 
     def lies_in(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Normal3f:
         return mi.Normal3f(dr.normalize(self.face(row, active)[1].n_g))
