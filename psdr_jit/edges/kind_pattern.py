@@ -204,8 +204,7 @@ class MeshPatterns(PatternLines):
 
     def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         view = towards_viewer(viewpoint(frame, mi.Point2f(LENS_CENTRE)), corners[0])
-        _, e1, e2 = _face(self.positions, self.lines.rows, mi.Bool(True))
-        cos = facing(mi.Normal3f(dr.normalize(dr.cross(e1, e2))), view)
+        cos = facing(_normal(self.positions, self.lines.rows, mi.Bool(True)), view)
         slack = frame.aperture if frame.kind == "thinlens" else 0.0  # how far the viewpoint may be from the centre
         away = ((self.front == 0) | (cos <= -slack)) & ((self.back == 0) | (cos >= slack))
         return away | beside_film(frame, corners, border)
@@ -221,14 +220,19 @@ class MeshPatterns(PatternLines):
         return Side(mi.Ray3f(sight.viewer, sight.ω), pi, mi.Bool(False), mi.Bool(True), mi.Bool(True))
 
     def lies_in(self, row: mi.UInt32, sight: Sight, active: mi.Bool) -> mi.Normal3f:
-        _, e1, e2 = _face(self.positions, dr.gather(PatternRows, self.lines.rows, row, active), active)
-        return mi.Normal3f(dr.normalize(dr.cross(e1, e2)))
+        return _normal(self.positions, dr.gather(PatternRows, self.lines.rows, row, active), active)
 
 
 def _face(positions: mi.Point3f, rows: PatternRows, active) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
     """A corner of the rows' faces, and the sides from there."""
     p0, p1, p2 = (dr.gather(mi.Point3f, positions, v, active) for v in (rows.v0, rows.v1, rows.v2))
     return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
+
+
+def _normal(positions: mi.Point3f, rows: PatternRows, active) -> mi.Normal3f:
+    """Unit normal of the rows' faces."""
+    _, e1, e2 = _face(positions, rows, active)
+    return mi.Normal3f(dr.normalize(dr.cross(e1, e2)))
 
 
 class Surface(IntEnum):

@@ -130,6 +130,7 @@ class LightSteps:
             wavelengths = type(wavelengths)(WAVELENGTH)
         ray = self.ray(lane // PROBES, (mi.Float(lane % PROBES) + 0.5) / PROBES)
         parted = dr.max(dr.abs(ray.step(far, wavelengths, mi.Bool(True)))) * dr.square(far)
+        dr.eval(ray.across, parted)  # else each sum has a kernel that does it all
         length, step = (dr.block_reduce(dr.ReduceOp.Add, x, PROBES) / PROBES for x in (ray.across, parted))
         mean = dr.mean(step)
         dr.make_opaque(mean)
