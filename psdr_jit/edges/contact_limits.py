@@ -96,6 +96,17 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             UnsupportedWarning,
             memory,
         )
+    for lamp, other in contacts.lamps if job.options.hide_emitters else ():
+        if lamp.shape_type() != int(mi.ShapeType.Sphere):
+            continue
+        warn_once(
+            f"the sphere '{shown_name(lamp)}' is an area light, which hide_emitters makes transparent, and cuts into "
+            f"'{shown_name(other)}': along the curve where they meet, the light on '{shown_name(other)}' changes with "
+            "the root of the distance, and 5 to 10 % of the derivative there are missing; keep them apart by a "
+            "hundredth of their size, or replace the sphere by a mesh",
+            UnsupportedWarning,
+            memory,
+        )
     for lamp, other in contacts.lamps:
         if other.bsdf() is not None and mi.has_flag(other.bsdf().flags(), mi.BSDFFlags.Null):
             warn_once(

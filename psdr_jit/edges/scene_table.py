@@ -22,6 +22,7 @@ from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.facts import ShapeFacts
 from ..scene.grids import ALIKE, bent_degrees
+from ..scene.registry import registry_table
 from ..scene.tangent_facts import vertex_speeds
 from .buried import buried
 from .capped import joined_rims
@@ -31,6 +32,7 @@ from .contact_motion import warn_about_parting
 from .curves import CURVES_OF, PIECES, curve_set
 from .edge_shapes import edge_shapes
 from .grid_set import GridSet
+from .junctions import JunctionRows
 from .kind import EdgeKind
 from .kind_analytic import AnalyticCurves
 from .kind_ellipsoid import EllipsoidOutlines, warn_about_touching
@@ -154,8 +156,9 @@ def _between_faces(
         rows, index, count = _reachable(job, found.junctions.edges, bodies)
         hidden += count
         if rows is not None:
-            through = _looked_through(job, meshes, rows)
-            kinds.append(Junctions(_as_seen(rows, outside), index, found.junctions.rows, centre, job.surfaces, through))
+            curves = found.junctions.rows
+            through = _looked_through(job, curves, index)
+            kinds.append(Junctions(_as_seen(rows, outside), index, curves, centre, job.surfaces, through))
     dr.eval([kind.rows for kind in kinds])  # now, not with the term that needs them first: its kernels would differ
     return kinds, hidden
 
@@ -186,10 +189,11 @@ def _is_hidden(job: Job, facts: ShapeFacts) -> bool:
     return facts.is_emitter and job.options.hide_emitters
 
 
-def _looked_through(job: Job, meshes: list[ShapeFacts], rows: EdgeRows) -> mi.Bool:
-    """By row: does one of its faces belong to a light that the sensor looks through?"""
-    lights = mi.Float([float(_is_hidden(job, facts)) for facts in meshes])
-    through = sum(dr.gather(mi.Float, lights, shape) for shape in (rows.shape0, rows.shape1)) > 0
+def _looked_through(job: Job, curves: JunctionRows, index: mi.UInt32) -> mi.Bool:
+    """By row: does one of the surfaces at the curve `index` belong to a light that the sensor looks through?"""
+    hidden = registry_table(job.scene, {facts.index for facts in job.facts.shapes if _is_hidden(job, facts)})
+    shapes = (dr.gather(mi.UInt32, sheet.shape, index) for sheet in (curves.a, curves.b))
+    through = sum(dr.gather(mi.UInt32, hidden, shape) for shape in shapes) > 0
     dr.eval(through)
     return through
 
