@@ -31,7 +31,6 @@ from .chain_finds import Finds, empty_stack, push, read
 from .chain_guess import Guesses
 from .chain_intervals import BEHIND, FRONT, Crossing, Interval
 from .chain_lamps import NEAR
-from .chain_surface import NOWHERE
 from .chain_trace import Pair
 from .searched_lines import SearchedLines
 
@@ -48,7 +47,7 @@ WITHIN = 0.5 - 2.0**-4
 LANES_OF_THREAD, LANES_OF_GPU = 256, 2**18
 
 #: What a search does next: nothing; or compare the ends of the whole interval, or a place inside with the near end;
-#: halve what is between lo and hi, check what halving came to (where the last comparison was not of these two).
+#: halve what is between lo and hi, check what halving came to.
 END, LOOK, PROBE, HALVE, CHECK = range(5)
 
 
@@ -62,13 +61,12 @@ class Search:
     hi: mi.Float
     moves: mi.Bool  # can the step that it halves to?
     guess: mi.Float  # where it is, or NOWHERE; where the interval is looked into
-    failed: mi.Bool  # it was not where the last guess had it
 
     @staticmethod
     def begin(at: Interval) -> Search:
         n = dr.width(at.sample)
         lo, hi = (dr.zeros(mi.Float, n) for _ in range(2))
-        return Search(at, begun(at), lo, hi, dr.zeros(mi.Bool, n), at.middle(), dr.zeros(mi.Bool, n))
+        return Search(at, begun(at), lo, hi, dr.zeros(mi.Bool, n), at.middle())
 
     def compared(self, least: mi.Float) -> tuple[mi.Float, mi.Float]:
         """The places whose chains are compared next."""
@@ -78,11 +76,11 @@ class Search:
         return dr.select(whole, at.lo, self.lo), dr.select(whole, into, halfway)
 
     def middle(self, least: mi.Float) -> mi.Float:
-        """Where what is between lo and hi is halved: beside the guess, but for every other time if guesses fail."""
+        """Where what is between lo and hi is halved."""
         off = dr.maximum(BESIDE * dr.square(self.hi - self.lo), 0.25 * least)
         guess = dr.clip(self.guess, self.lo, self.hi)
         beside = guess + dr.select(guess - self.lo < self.hi - guess, off, -off)
-        inside = (dr.abs(guess - self.guess) < off) & (beside > self.lo) & (beside < self.hi) & ~self.failed
+        inside = (dr.abs(guess - self.guess) < off) & (beside > self.lo) & (beside < self.hi)
         return dr.select(inside, beside, 0.5 * (self.lo + self.hi))
 
     def looked_into(self, pair: Pair, ends: tuple[mi.Float, mi.Float], narrowest: float) -> tuple:
@@ -127,8 +125,7 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
         lo = dr.select(apart, start, dr.select(halve & ~first, end, search.lo))
         moves = dr.select(apart | first | checked, pair.moves, search.moves)
         again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
-        narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
-        crossed = active & ((checked & pair.differs & ~again) | (first & narrow))
+        crossed = active & checked & pair.differs & ~again
 
         found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh, at.uneven), pair.k)
         finds.write(task, slot, moves & ~pair.chosen & (pair.k >= lines.first_kept), found, crossed)
@@ -138,7 +135,8 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
         slot += dr.select(crossed, mi.UInt32(1), 0)
 
         kept, part, place = search.looked_into(pair, (start, end), narrowest)
-        halved = apart | (halve & ~crossed) | again
+        halved = apart | halve | again
+        narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
         behind = at.part(hi, at.hi, BEHIND, mi.Bool(True), mi.Bool(False))
         at = dr.select(halved, at, dr.select(crossed, behind, part))
         ends = ~halved & ~crossed & ~kept
@@ -149,8 +147,7 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
         mode = dr.select(ends & ~returns, END, mode)
         guess = dr.select(apart | first, guesses.place(pair, start, end, apart | first), search.guess)
         guess = dr.select(mode == PROBE, dr.select(returns, at.middle(), place), guess)
-        failed = halve & ~search.failed & (search.guess != NOWHERE) & (first != (end > search.guess))
-        search = Search(at, mode, lo, hi, moves, guess, failed)
+        search = Search(at, mode, lo, hi, moves, guess)
 
         done = active & ((mode == END) | ((mode <= PROBE) & (slot == finds.slots)))
         finds.leave(task, search, stack, height, segments, done)

@@ -87,26 +87,8 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             UnsupportedWarning,
             memory,
         )
-    for lamp, other in contacts.standing if job.options.hide_emitters else ():
-        warn_once(
-            f"the area light '{shown_name(lamp)}', which hide_emitters makes transparent, stands on "
-            f"'{shown_name(other)}': where the camera sees through it what it stands on, a part of the derivative is "
-            "missing (a quarter for a cube of light on a floor, as the camera moves); lift it by a hundredth of its "
-            "size, or sink it in",
-            UnsupportedWarning,
-            memory,
-        )
-    for lamp, other in contacts.lamps if job.options.hide_emitters else ():
-        if lamp.shape_type() != int(mi.ShapeType.Sphere):
-            continue
-        warn_once(
-            f"the sphere '{shown_name(lamp)}' is an area light, which hide_emitters makes transparent, and cuts into "
-            f"'{shown_name(other)}': along the curve where they meet, the light on '{shown_name(other)}' changes with "
-            "the root of the distance, and 5 to 10 % of the derivative there are missing; keep them apart by a "
-            "hundredth of their size, or replace the sphere by a mesh",
-            UnsupportedWarning,
-            memory,
-        )
+    if job.options.hide_emitters:
+        _warn_about_hidden_lamps(contacts, memory)
     for lamp, other in contacts.lamps:
         if other.bsdf() is not None and mi.has_flag(other.bsdf().flags(), mi.BSDFFlags.Null):
             warn_once(
@@ -125,6 +107,30 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             "the derivative of the light on it is wrong and noisy (15 % of the total if there is no other light), and "
             "so is what one "
             f"covers of the other if they move against each other; {cure}",
+            UnsupportedWarning,
+            memory,
+        )
+
+
+def _warn_about_hidden_lamps(contacts: Touching, memory: Memory) -> None:
+    """Of lights that the camera looks through."""
+    for lamp, other in contacts.standing:
+        warn_once(
+            f"the area light '{shown_name(lamp)}', which hide_emitters makes transparent, stands on "
+            f"'{shown_name(other)}': where the camera sees through it what it stands on, a part of the derivative is "
+            "missing (a quarter for a cube of light on a floor, as the camera moves); lift it by a hundredth of its "
+            "size, or sink it in",
+            UnsupportedWarning,
+            memory,
+        )
+    for lamp, other in contacts.lamps:
+        if lamp.shape_type() != int(mi.ShapeType.Sphere):
+            continue
+        warn_once(
+            f"the sphere '{shown_name(lamp)}' is an area light, which hide_emitters makes transparent, and cuts into "
+            f"'{shown_name(other)}': along the curve where they meet, the light on '{shown_name(other)}' changes with "
+            "the root of the distance, and 5 to 10 % of the derivative there are missing; keep them apart by a "
+            "hundredth of their size, or replace the sphere by a mesh",
             UnsupportedWarning,
             memory,
         )

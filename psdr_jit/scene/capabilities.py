@@ -138,7 +138,7 @@ SUPPORT = (
     Row("other sensors", "error", _MOVING + "materials and radiance are fine"),
     Row("area, constant, environment map", "yes",
         "warning: paint that shares texture coordinates; lights that `hide_emitters` hides before curved shapes, or "
-        "where they stand on others; maps whose pose does more than to turn them"),
+        "where they stand on others or are spheres that cut into them; maps whose pose does more than to turn them"),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
     Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
