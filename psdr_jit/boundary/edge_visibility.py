@@ -16,8 +16,8 @@ from ..paths.rays import ROUNDING, see_through_emitters
 from ..paths.surface_at import surface_at
 from ..plan.job import Job
 
-#: How far below what is seen from behind it is looked at a second time, in steps to the side.
-BELOW = 8
+#: How much farther from its face the place is at which what is seen from behind is looked at a second time.
+FARTHER = 8
 
 
 def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool:
@@ -41,17 +41,17 @@ def hidden(job: Job, table: EdgeTable, sight: Sight, active: mi.Bool) -> mi.Bool
         blocked = _meets(job, ray, nearly, active)
         unsure = mi.Bool(True)
     blocked |= _has_behind_it(job, _between(ray(nearly), body), sheet, active & unsure & ~blocked)
-    return blocked | _seen_through_a_crack(job, sight, aim, sheet, BELOW * above, active & ~blocked)
+    return blocked | _seen_through_a_crack(job, sight, aim, sheet, FARTHER * above, active & ~blocked)
 
 
-def _seen_through_a_crack(job: Job, sight: Sight, aim: mi.Point3f, sheet: _Sheet, below: mi.Vector3f, active: mi.Bool):
+def _seen_through_a_crack(job: Job, sight: Sight, aim: mi.Point3f, sheet: _Sheet, off: mi.Vector3f, active: mi.Bool):
     """Did rays to the back of a face slip through between two others? At an outline, where both are all but edge-on,
-    the gap that rounding leaves is as wide as much of what is hidden there. They are gone a second time, to a point
-    farther `below` the face.
+    the gap that rounding leaves is as wide as much of what is hidden there. They are gone a second time, to a place
+    that is by `off` farther from the face, on the viewer's side.
     """
     from_behind = active & (dr.dot(sheet.n, sight.ω) > 0)
-    deeper = replace(sheet, body=sheet.body + below)
-    return _has_behind_it(job, _between(sight.viewer, aim + below), deeper, from_behind)
+    nearer = replace(sheet, body=sheet.body + off)
+    return _has_behind_it(job, _between(sight.viewer, aim + off), nearer, from_behind)
 
 
 def _faceted(job: Job) -> bool:

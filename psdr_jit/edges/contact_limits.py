@@ -123,9 +123,7 @@ def _warn_about_hidden_lamps(contacts: Touching, memory: Memory) -> None:
             UnsupportedWarning,
             memory,
         )
-    for lamp, other in contacts.lamps:
-        if lamp.shape_type() != int(mi.ShapeType.Sphere):
-            continue
+    for lamp, other in (pair for pair in contacts.lamps if pair[0].shape_type() == int(mi.ShapeType.Sphere)):
         warn_once(
             f"the sphere '{shown_name(lamp)}' is an area light, which hide_emitters makes transparent, and cuts into "
             f"'{shown_name(other)}': along the curve where they meet, the light on '{shown_name(other)}' changes with "

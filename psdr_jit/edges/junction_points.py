@@ -14,6 +14,13 @@ from .junctions import JunctionRows, Sheet
 PROBE = 1e-2
 
 
+def on_a_ball(rows: JunctionRows, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
+    """Are the junctions `index` arcs on a ball?"""
+    radius = dr.gather(mi.Float, rows.arc_radius, index, active)
+    axis = dr.gather(mi.Vector3f, rows.arc_axis, index, active)
+    return (radius > 0) & (dr.squared_norm(axis) == 0)
+
+
 def bend(rows: JunctionRows, index: mi.UInt32, x: mi.Point3f, dx: mi.Vector3f, active):
     """Carry a point of an arc's chord and its derivative onto the circle or ellipse; `index`: row of `rows`.
 

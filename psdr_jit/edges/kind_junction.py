@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..core.sensor_frame import SensorFrame
 from ..scene.surfaces import Surfaces
 from .film_cover import EdgeOnFilm, straight_cover
-from .junction_points import bend, junction_motion
+from .junction_points import bend, junction_motion, on_a_ball
 from .junctions import JunctionRows
 from .kind import OnEdge, Side, Sight, Use
 from .kind_mesh import BetweenFaces, on_fixed, straight_point
@@ -67,12 +67,6 @@ class Junctions(BetweenFaces):
         """
         return clear_of_lift(x) * cot_between(*self.normals(row, active))
 
-    def _on_a_ball(self, row: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        index = dr.gather(mi.UInt32, self.index, row, active)
-        radius = dr.gather(mi.Float, self.curves.arc_radius, index, active)
-        axis = dr.gather(mi.Vector3f, self.curves.arc_axis, index, active)
-        return (radius > 0) & (dr.squared_norm(axis) == 0)
-
     def open_side(self, row: mi.UInt32, dx: mi.Vector3f, ω: mi.Vector3f, active: mi.Bool):
         side = dr.cross(dx, ω)
         across = dr.norm(side)
@@ -97,7 +91,8 @@ class Junctions(BetweenFaces):
         through = dr.gather(mi.Bool, self.transparent, row, active)
         share = dr.select(~through & (in_front < across), in_front / across, 1)
         dark = self._in_the_dark(row, sight.at.x, active)
-        dark = dr.select(through & self._on_a_ball(row, active), dr.maximum(dark, clear_of_lift(sight.at.x)), dark)
+        by_lamp = through & on_a_ball(self.curves, dr.gather(mi.UInt32, self.index, row, active), active)
+        dark = dr.select(by_lamp, dr.maximum(dark, clear_of_lift(sight.at.x)), dark)
         step = sight.offset + share * dark
         nearer = dr.clip(step * dr.maximum(nearer0, nearer1), 0, NEAREST * sight.r)
         return Side.found_by(mi.Ray3f(sight.at.x + step * s - (sight.lead + nearer) * sight.ω, sight.ω))

@@ -10,8 +10,8 @@ import pytest
 from helpers import adjoint_identity, fd, forward
 
 import psdr_jit
-from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.derivative.statistics import gain
+from psdr_jit.derivative.perturbation import Perturbation, perturb
+from psdr_jit.derivative.statistics import Gain, gain
 from psdr_jit.errors import UnsupportedWarning
 
 SEEDS, SPP, REFERENCE_SPP, EPS = 16, 512, 2048, 4e-3
@@ -142,6 +142,13 @@ def test_a_hidden_lamp_on_a_floor_is_named(mono, sunk_by, hidden):
     assert named == (hidden and sunk_by == 0)
 
 
+def slope_behind_lamps(motion: Perturbation, eps: float, seeds: int) -> Gain:
+    """Of what the camera sees through lights that are hidden from it."""
+    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", "hide_emitters": True}
+    differences = fd(motion, spec, eps, seeds, 1024)
+    return gain(forward(motion, spec, 16, 256), differences[0::2], differences[1::2])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plugin, tilt", [("cube", 0), ("cube", 35), ("cylinder", 30), ("cylinder", 65)])
 def test_a_hidden_lamp_in_a_floor(mono, plugin, tilt):
@@ -150,9 +157,7 @@ def test_a_hidden_lamp_in_a_floor(mono, plugin, tilt):
     sky = {"type": "constant", "radiance": 0.3}
     scene = room({"type": plugin, "to_world": to_world, "emitter": glow()}, sky=sky)
     motion = perturb(scene, "camera.to_world", (1, 0.2, 0.3))
-    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", "hide_emitters": True}
-    differences = fd(motion, spec, 0.004, 256, 1024)
-    slope = gain(forward(motion, spec, 16, 256), differences[0::2], differences[1::2])
+    slope = slope_behind_lamps(motion, 0.004, 256)
     assert slope.stderr < 0.02
     assert abs(slope.value - 1) < 3 * slope.stderr + 0.01, slope
 
@@ -163,11 +168,8 @@ def test_a_hidden_ball_in_a_floor_is_named_and_roughly_right(mono):
     for y in (0, -0.1):
         at = mi.ScalarTransform4f().translate([0.1, y, 0]).scale(0.4)
         motion = perturb(room({"type": "sphere", "to_world": at, "emitter": glow()}), "camera.to_world", (1, 0.2, 0.3))
-        spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", "hide_emitters": True}
         with pytest.warns(UnsupportedWarning, match="sphere 'lamp' .* cuts into 'floor'"):
-            image = forward(motion, spec, 8, 256)
-        differences = fd(motion, spec, 0.002, 128, 1024)
-        slope = gain(image, differences[0::2], differences[1::2])
+            slope = slope_behind_lamps(motion, 0.002, 128)
         assert slope.stderr < 0.05 and 0.85 < slope.value < 1.05, (y, slope)
 
 
@@ -181,9 +183,7 @@ def test_a_hidden_cylinder_that_cuts_into_a_box(mono):
     box = {"type": "cube", "to_world": at}
     scene = room(lamp, box=box, sky={"type": "constant", "radiance": 0.9})
     motion = perturb(scene, "lamp.to_world", (-0.763, 0.495, -0.416))
-    spec = {"type": "psdr_path", "max_depth": 2, "form": "spatial", "hide_emitters": True}
-    differences = fd(motion, spec, 0.002, 128, 1024)
-    slope = gain(forward(motion, spec, 16, 256), differences[0::2], differences[1::2])
+    slope = slope_behind_lamps(motion, 0.002, 128)
     assert slope.stderr < 0.02
     assert abs(slope.value - 1) < 3 * slope.stderr + 0.01, slope
 
