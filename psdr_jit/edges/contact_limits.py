@@ -4,12 +4,18 @@ For x on the one shape and y on the other, at the distances a and b from where t
 degree −1 in (a, b) and its derivative, with both points at rest on their surfaces, of degree −2: its integral over both
 depends on the shape of the corner that is left out. Rays start a little above surfaces and leave out one of the wrong
 shape; the rest that this leaves does not depend on its size.
+
+Where the two are at rest against each other, but the camera moves, or both of them before it, the material form has
+the derivative at the vertex that is seen alone: what is seen slides over its surface, what it is lit by does not. With
+a its distance, b that of the other point, the integral over b is 0 for reasons of scale, that of its square ~ 1/a²: the
+derivative is right, and its variance, ∫ da / a² down to where rays start, far above what a few seeds show.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import drjit as dr
 import mitsuba as mi
@@ -21,10 +27,13 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.names import shown_name
+from . import intersections as cut
 from .contacts import Contact, normals_beside
 from .seams import is_smooth
 from .segments import EdgeSet
 from .solids import Ball, Solid, triangles
+from .standing_rims import Body
+from .topology import INVALID
 
 #: Sine of the angle between two faces from which one stands off the other.
 STANDS_OFF = 0.05
@@ -50,13 +59,18 @@ class Touching:
     movers: tuple[mi.Shape, mi.Shape] | None = None  # of which one moves against the other
     standing: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # of `lamps`, those with an edge or a face in the other
     glass: tuple[tuple[mi.Shape, mi.Shape], ...] = ()  # smooth glass, and what a face of it is flush with
+    slid_over: tuple[mi.Shape, mi.Shape] | None = None  # at rest against each other, which what is seen slides over
 
 
-def touching(found: EdgeSet, memory: Memory) -> Touching:
-    """Of the edges that were found."""
+def touching(found: EdgeSet, on_rims: Sequence[tuple[Body, Body]], camera_moves: bool, memory: Memory) -> Touching:
+    """Of the edges that were found, and of what stands on rims."""
     glass = tuple(_flush_glass(found, memory))
-    standing, cut = tuple(_with_lamp(_standing(found, memory))), tuple(_with_lamp(_cut(found)))
-    return Touching(standing + cut, next(_moved_against(found), None), standing, glass)
+    standing = tuple(_with_lamp(_standing(found, memory)))
+    cut_lamps = tuple(_with_lamp((_shape(a), _shape(b)) for a, b in _cut(found)))
+    met = [*_cut(found), *on_rims]
+    movers = next(_moved_against(found, met), None)
+    slid_over = next(_slid_over(found, met, camera_moves, memory), None)
+    return Touching(standing + cut_lamps, movers, standing, glass, slid_over)
 
 
 def warn_about_contacts(job: Job, contacts: Touching) -> None:
@@ -69,16 +83,8 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
     if job.options.depth_limit < 2:
         return
     memory = job.call.memory
-    if contacts.movers is not None and job.form == "material" and job.options.depth_limit > 2:
-        a, b = contacts.movers
-        warn_once(
-            f"shapes '{shown_name(a)}' and '{shown_name(b)}' touch and move against each other: in "
-            "the material form, which this integrator was asked for, the light that goes from one to the other where "
-            "they meet is wrong (10 % of the "
-            "derivative) and noisy; use form='spatial', or 'auto', which knows of contacts",
-            UnsupportedWarning,
-            memory,
-        )
+    if job.form == "material" and job.options.depth_limit > 2:
+        _warn_about_material_form(contacts, memory)
     for glass, other in contacts.glass:
         warn_once(
             f"a face of '{shown_name(glass)}', which is smooth glass, lies in one of '{shown_name(other)}': which of "
@@ -107,6 +113,30 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
             "the derivative of the light on it is wrong and noisy (15 % of the total if there is no other light), and "
             "so is what one "
             f"covers of the other if they move against each other; {cure}",
+            UnsupportedWarning,
+            memory,
+        )
+
+
+def _warn_about_material_form(contacts: Touching, memory: Memory) -> None:
+    """Of what a path's points that stay on their surfaces do to light between two of them."""
+    if contacts.movers is not None:
+        a, b = contacts.movers
+        warn_once(
+            f"shapes '{shown_name(a)}' and '{shown_name(b)}' touch and move against each other: in "
+            "the material form, which this integrator was asked for, the light that goes from one to the other where "
+            "they meet is wrong (10 % of the "
+            "derivative) and noisy; use form='spatial', or 'auto', which knows of contacts",
+            UnsupportedWarning,
+            memory,
+        )
+    if contacts.slid_over is not None:
+        a, b = contacts.slid_over
+        warn_once(
+            f"shapes '{shown_name(a)}' and '{shown_name(b)}' touch, and what is seen slides over both: in the material "
+            "form, which this integrator was asked for, the light that goes from one to the other where they meet is "
+            "so noisy (30 times the standard deviation of the spatial form) that a few images do not show how noisy; "
+            "use form='spatial', or 'auto'",
             UnsupportedWarning,
             memory,
         )
@@ -163,11 +193,21 @@ def _standing(found: EdgeSet, memory: Memory) -> Iterator[tuple[mi.Shape, mi.Sha
             yield c.a.mesh, c.b.mesh
 
 
-def _cut(found: EdgeSet) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+def _cut(found: EdgeSet) -> Iterator[tuple[Solid | Ball, Solid | Ball]]:
     """Pairs that cut into each other."""
     for first, second in found.junctions.pairs if found.junctions is not None else ():
         if first is not second:
-            yield _shape(first), _shape(second)
+            yield first, second
+
+
+def _slid_over(
+    found: EdgeSet, met: Sequence[tuple], camera_moves: bool, memory: Memory
+) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+    """Pairs that meet at an angle, over which the rays of the camera slide though neither moves against the other."""
+    bent = (c for c in found.contacts if c.a is not c.b and _answer(_bent_where_they_meet, c, memory))
+    for a, b in chain(met, ((c.a, c.b) for c in bent)):
+        if a.moves == b.moves and (camera_moves or a.moves):
+            yield _shape(a), _shape(b)
 
 
 def _with_lamp_at_an_angle(c: Contact, memory: Memory) -> bool:
@@ -203,6 +243,11 @@ def _at_an_angle(contact: Contact) -> bool:
     return any(bool(np.any(sine > STANDS_OFF)) for sine in _sines(contact))
 
 
+def _bent_where_they_meet(contact: Contact) -> bool:
+    """Does a face beside an edge that is in the other mesh, or is an edge of both, stand off a face of that?"""
+    return _at_an_angle(contact) or any(bool(np.any(sine > STANDS_OFF)) for sine in _sines_across(contact))
+
+
 def _flush(contact: Contact) -> bool:
     """Does it lie in it?"""
     return any(bool(np.any(sine < FLUSH)) for sine in _sines(contact))
@@ -216,15 +261,22 @@ def _sines(contact: Contact) -> Iterator[np.ndarray]:
             yield np.linalg.norm(np.cross(here, there), axis=1)[exists]
 
 
-def _moved_against(found: EdgeSet) -> Iterator[tuple[mi.Shape, mi.Shape]]:
+def _sines_across(contact: Contact) -> Iterator[np.ndarray]:
+    """Of the angles between faces beside edges that both meshes have, one of each."""
+    a, b, shared = triangles(contact.a), triangles(contact.b), contact.shared
+    for here in a.edge_faces[shared.a].T:
+        for there in b.edge_faces[shared.b].T:
+            exist = (here != INVALID) & (there != INVALID)
+            normals = [cut.unit_normals(m.corners(faces[exist])) for m, faces in ((a, here), (b, there))]
+            yield np.linalg.norm(np.cross(*normals), axis=1)
+
+
+def _moved_against(found: EdgeSet, met: Sequence[tuple]) -> Iterator[tuple[mi.Shape, mi.Shape]]:
     """Pairs that touch of which one can move."""
-    for c in found.contacts:
-        if c.a.moves != c.b.moves:
-            yield c.a.mesh, c.b.mesh
-    for first, second in found.junctions.pairs if found.junctions is not None else ():
-        if first.moves != second.moves:
-            yield _shape(first), _shape(second)
+    for a, b in chain(((c.a, c.b) for c in found.contacts), met):
+        if a.moves != b.moves:
+            yield _shape(a), _shape(b)
 
 
-def _shape(item: Solid | Ball) -> mi.Shape:
+def _shape(item: Solid | Ball | Body) -> mi.Shape:
     return item.mesh if isinstance(item, Solid) else item.shape

@@ -52,7 +52,7 @@ from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
 from .smooth_faces import smooth_faces
 from .solids import Ball, Drum
-from .standing_rims import warn_about_lifted_rims
+from .standing_rims import standing, warn_about_lifted_rims
 from .table import EdgeTable
 
 #: Of one render call: the table.
@@ -107,7 +107,9 @@ def edge_table(job: Job) -> EdgeTable:
         kinds += _grid_edges(job, grids, centre)
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
-    return EdgeTable(tuple(kinds), hidden, touching(straight, job.call.memory))
+    on_rims = standing(shapes, chosen) if job.options.form == "material" else []
+    contacts = touching(straight, on_rims, job.facts.camera_moves, job.call.memory)
+    return EdgeTable(tuple(kinds), hidden, contacts)
 
 
 def _edge_set(job: Job, meshes: list[ShapeFacts], balls: tuple[Ball | Drum, ...]) -> EdgeSet:

@@ -1,12 +1,12 @@
-"""Rims of cylinders and disks that lie in faces of other shapes, as of cups on tables and pillars on floors, and are
-moved off these, or into them: as for meshes (`contact_motion.py`), the image has a kink there.
+"""Rims of cylinders and disks that lie in faces of other shapes, as of cups on tables and pillars on floors.
 
-Rims stand for polygons, and disks for fans of triangles about them. Needs the direction of the derivative.
+Where they are moved off these, or into them, the image has a kink, as for meshes (`contact_motion.py`), which needs
+the direction of the derivative. Rims stand for polygons, and disks for fans of triangles about them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +21,7 @@ from .intersections import TriangleMesh, tolerance
 from .overlaps import box_of, touching_boxes
 from .solids import corners_and_faces
 from .topology import INVALID, WELD_TOLERANCE
-from .touching import parts_in_faces
+from .touching import Resting, parts_in_faces
 
 #: Corners of the polygon that a rim stands for.
 CORNERS = 48
@@ -34,12 +34,19 @@ _RING = np.stack([np.arange(CORNERS), (np.arange(CORNERS) + 1) % CORNERS], 1)
 
 
 @dataclass(frozen=True)
-class _Body:
+class Body:
     """A shape with rims, or with faces in which rims may lie."""
 
     shape: mi.Shape
-    plugin: str
-    moves: bool
+    facts: ShapeFacts
+
+    @property
+    def plugin(self) -> str:
+        return self.facts.plugin
+
+    @property
+    def moves(self) -> bool:
+        return self.facts.moves
 
     @cached_property
     def rims(self) -> TriangleMesh:
@@ -72,22 +79,39 @@ class _Body:
 
 def warn_about_lifted_rims(job: Job, shapes: Sequence[mi.Shape], chosen: Sequence[ShapeFacts]) -> None:
     """Name shapes of which one stands on the other by a rim, and leaves it, each pair once. `chosen`: of `shapes`."""
-    if job.call.mode != "forward" or not any(s.plugin in RIMS for s in chosen):
+    if job.call.mode != "forward":
         return
-    bodies = [_Body(shapes[s.index], s.plugin, s.moves) for s in chosen]
-    for i, j in touching_boxes([box_of(body.shape) for body in bodies]):
-        a, b = bodies[i], bodies[j]
+    for a, b in _neighbours(shapes, chosen):
         if (a.moves or b.moves) and (_leaves(a, b) or _leaves(b, a)):
             say_parted(job, a.shape, b.shape)
 
 
-def _leaves(own: _Body, other: _Body) -> bool:
-    """Do rims of `own` lie in faces of `other`, and move off these?"""
+def standing(shapes: Sequence[mi.Shape], chosen: Sequence[ShapeFacts]) -> list[tuple[Body, Body]]:
+    """Cylinders, and what they stand on or what stands on them. `chosen`: of `shapes`."""
+    pairs = ((own, other) for a, b in _neighbours(shapes, chosen) for own, other in ((a, b), (b, a)))
+    return [(own, other) for own, other in pairs if own.plugin == "cylinder" and len(_resting(own, other).edge)]
+
+
+def _neighbours(shapes: Sequence[mi.Shape], chosen: Sequence[ShapeFacts]) -> Iterator[tuple[Body, Body]]:
+    """Those whose boxes touch, if there are rims at all."""
+    if any(s.plugin in RIMS for s in chosen):
+        bodies = [Body(shapes[s.index], s) for s in chosen]
+        for i, j in touching_boxes([box_of(body.shape) for body in bodies]):
+            yield bodies[i], bodies[j]
+
+
+def _resting(own: Body, other: Body) -> Resting:
+    """Rims of `own` in faces of `other`."""
     if own.plugin not in RIMS or not len(other.faces.faces):
-        return False
+        return Resting(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     ends = own.rims.positions[own.rims.edges]
     slack = tolerance(own.rims.box, other.faces.box, relative=WELD_TOLERANCE)
-    found = parts_in_faces(ends, other.faces.positions[other.faces.faces].astype(float), slack)
+    return parts_in_faces(ends, other.faces.positions[other.faces.faces].astype(float), slack)
+
+
+def _leaves(own: Body, other: Body) -> bool:
+    """Do rims of `own` lie in faces of `other`, and move off these?"""
+    found = _resting(own, other)
     if not len(found.edge):
         return False
     v, v_other = own.speed_of_rims, other.speed_of_faces
