@@ -12,7 +12,7 @@ the right share; by numbers of their own, of 8 lines across a ball of glass 7 ±
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -66,6 +66,7 @@ class Leaving:
     through: mi.Bool  # by the one that leads through the surface
     probability: mi.Float  # with which one of two was chosen, else 1
     rest: mi.Float  # the number that chose, within the interval of what it chose: uniform again
+    η: mi.Float  # index of refraction behind the surface over that before it; 1 where it is not led through
 
 
 def has_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
@@ -106,19 +107,39 @@ def leave(
     ray = dr.select(smooth, si.spawn_ray(fixed.ω), onward.ray)
     factor = dr.select(smooth, f * dr.select(fixed.pdf > 0, dr.rcp(fixed.pdf), 0), onward.factor) / share
     alive = (smooth & dr.any(factor != 0)) | onward.alive
-    return Leaving(ray, factor, alive, onward.alive, onward.through, onward.probability, onward.rest)
+    return replace(onward, ray=ray, factor=factor, alive=alive)
 
 
-def lobes_part(onward: tuple[Leaving, Leaving], numbers: tuple[mi.Float, mi.Float]) -> tuple[mi.Bool, mi.Float]:
+def lobes_part(
+    ends: tuple[mi.SurfaceInteraction3f, mi.SurfaceInteraction3f],
+    onward: tuple[Leaving, Leaving],
+    numbers: tuple[mi.Float, mi.Float],
+) -> tuple[mi.Bool, mi.Float]:
     """Do two chains leave by different delta lobes, and at which share of the way from the one to the other does the
     choice change, roughly? `numbers`: those that chose, of which the reflected lobe has the lowest.
+
+    What is led through changes about evenly with x = cos θ on the thinner side, and x² with the place, but for total
+    reflection: where that begins x is 0, and the probability jumps to 1.
     """
     a, b = onward
-    past_a, past_b = (
-        u - dr.select(leaving.through, 1 - leaving.probability, leaving.probability)
-        for leaving, u in zip(onward, numbers, strict=True)
-    )
-    return a.by_delta & b.by_delta & (a.through != b.through), past_a / (past_a - past_b)
+    η = dr.select(a.through, a.η, b.η)
+    (x2_a, past_a), (x2_b, past_b) = (_past(*end, η) for end in zip(ends, onward, numbers, strict=True))
+    t = past_a / (past_a - past_b)
+    x_a, x_b = dr.safe_sqrt(x2_a), dr.safe_sqrt(x2_b)
+    x = dr.lerp(x_a, x_b, t)
+    apart = (x2_a < 0) | (x2_b < 0)  # elsewhere without differences of what is nearly equal
+    share = dr.select(apart, (x2_a - dr.square(x)) / (x2_a - x2_b), t * (x_a + x) / (x_a + x_b))
+    return a.by_delta & b.by_delta & (a.through != b.through), share
+
+
+def _past(si: mi.SurfaceInteraction3f, leaving: Leaving, u: mi.Float, η: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """`(x², negative in total reflection; by how much u is past the probability of reflection)`: there, past the one
+    where total reflection begins.
+    """
+    sin2 = mi.Frame3f.sin_theta_2(si.wi)
+    x2 = 1 - dr.select(η < 1, sin2 / dr.square(η), sin2)
+    past = u - dr.select(leaving.through, 1 - leaving.probability, leaving.probability)
+    return x2, dr.select(x2 < 0, dr.minimum(u - (1 - LEAST_LOBE), 0), past)
 
 
 def _delta_kinds(bsdf: mi.BSDFPtr) -> tuple[mi.Bool, mi.Bool]:
@@ -149,4 +170,5 @@ def _delta_leave(si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext, u: mi.Float, 
     ray = si.spawn_ray(si.to_world(bs.wo))
     factor = dr.select(alive, value / probability, 0)
     rest = dr.clip((u - dr.select(through, 1 - probability, 0)) / probability, 0, ALMOST_ONE)
-    return Leaving(ray, factor, alive, alive, through, probability, rest)
+    η = dr.select(through & there, bs.eta, 1)
+    return Leaving(ray, factor, alive, alive, through, probability, rest, η)

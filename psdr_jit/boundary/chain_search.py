@@ -60,13 +60,14 @@ class Search:
     lo: mi.Float
     hi: mi.Float
     moves: mi.Bool  # can the step that it halves to?
+    width: mi.Float  # at which halving ends
     guess: mi.Float  # where it is, or NOWHERE; where the interval is looked into
 
     @staticmethod
     def begin(at: Interval) -> Search:
         n = dr.width(at.sample)
-        lo, hi = (dr.zeros(mi.Float, n) for _ in range(2))
-        return Search(at, begun(at), lo, hi, dr.zeros(mi.Bool, n), at.middle())
+        lo, hi, width = (dr.zeros(mi.Float, n) for _ in range(3))
+        return Search(at, begun(at), lo, hi, dr.zeros(mi.Bool, n), width, at.middle())
 
     def compared(self, least: mi.Float) -> tuple[mi.Float, mi.Float]:
         """The places whose chains are compared next."""
@@ -93,6 +94,15 @@ class Search:
         part.fresh, part.uneven = (checks | (probes & mark) for mark in (half.fresh, half.uneven))
         kept, part = part.kept(pair.specular | checks, lamp, narrowest)
         return kept, part, dr.select(lamp, dr.lerp(start, end, pair.lamp), part.middle())
+
+
+def _enough(pair: Pair, least: mi.Float, narrowest: float) -> mi.Float:
+    """Width at which halving ends where these part. By the choice of a lobe: what is narrower is not looked into."""
+    return dr.select(
+        pair.moves,
+        dr.select(pair.chosen, dr.maximum(least, narrowest), least),
+        dr.maximum(least, AT_REST),
+    )
 
 
 def begun(at: Interval) -> mi.UInt32:
@@ -124,7 +134,8 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
         hi = dr.select(apart | first, end, search.hi)
         lo = dr.select(apart, start, dr.select(halve & ~first, end, search.lo))
         moves = dr.select(apart | first | checked, pair.moves, search.moves)
-        again = checked & pair.differs & moves & (hi - lo > least)  # taken for one that rests
+        width = dr.select(apart | first | checked, _enough(pair, least, narrowest), search.width)
+        again = checked & pair.differs & (hi - lo > width)  # taken for something else
         crossed = active & checked & pair.differs & ~again
 
         found = Crossing(Interval(at.sample, lo, hi, at.weight, at.key, at.fresh, at.uneven), pair.k)
@@ -136,7 +147,7 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
 
         kept, part, place = search.looked_into(pair, (start, end), narrowest)
         halved = apart | halve | again
-        narrow = hi - lo <= dr.select(moves, least, dr.maximum(least, AT_REST))
+        narrow = hi - lo <= width
         behind = at.part(hi, at.hi, BEHIND, mi.Bool(True), mi.Bool(False))
         at = dr.select(halved, at, dr.select(crossed, behind, part))
         ends = ~halved & ~crossed & ~kept
@@ -147,7 +158,7 @@ def _search(lines: SearchedLines, guesses: Guesses, queue: Search, finds: Finds)
         mode = dr.select(ends & ~returns, END, mode)
         guess = dr.select(apart | first, guesses.place(pair, start, end, apart | first), search.guess)
         guess = dr.select(mode == PROBE, dr.select(returns, at.middle(), place), guess)
-        search = Search(at, mode, lo, hi, moves, guess)
+        search = Search(at, mode, lo, hi, moves, width, guess)
 
         done = active & ((mode == END) | ((mode <= PROBE) & (slot == finds.slots)))
         finds.leave(task, search, stack, height, segments, done)

@@ -176,7 +176,7 @@ def trace_pair(
         lobe_a, lobe_b = lobe_a.or_fresh(u.lobe.y), lobe_b.or_fresh(u.lobe.y)
         on_a = leave(a, pair.k, mi.Point2f(u.lobe.x, lobe_a.u), direction, active, ctx)
         on_b = leave(b, pair.k, mi.Point2f(u.lobe.x, lobe_b.u), direction, active, ctx)
-        pair.chosen, place = lobes_part((on_a, on_b), (lobe_a.u, lobe_b.u))
+        pair.chosen, place = lobes_part((a, b), (on_a, on_b), (lobe_a.u, lobe_b.u))
         pair.differs, pair.where = pair.differs | pair.chosen, dr.select(pair.chosen, place, pair.where)
         lobe_a, lobe_b = lobe_a.behind(on_a, active), lobe_b.behind(on_b, active)
         if dr.hint(store is not None, mode="scalar"):
