@@ -26,6 +26,11 @@ _TURNED = (
     "a shapegroup and turn an instance of it"
 )
 
+_SEVERAL = "has a to_world of several matrices: assign one"
+
+#: Of one matrix.
+MATRIX_SIZE, MATRIX_AXES = 16, 2
+
 
 def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
     """What is wrong with the pose of a shape, and the way out; "" where nothing is, or while a function is frozen."""
@@ -34,6 +39,8 @@ def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
     matrix = _pose_of(graph, shape)
     if matrix is None:
         return ""
+    if matrix.ndim != MATRIX_AXES:
+        return _SEVERAL
     if plugin in MET_IN_OBJECT_SPACE:
         return "" if _inverts(graph, shape, matrix) else _ONE_WAY
     if plugin in GRID_SHAPES:
@@ -55,6 +62,8 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
     matrix = _pose_of(graph, emitter)
     if matrix is None:
         return ""
+    if matrix.ndim != MATRIX_AXES:
+        return _SEVERAL
     axes = matrix[:3, :3]
     if np.abs(axes.T @ axes - np.eye(3)).max() <= UNEVEN_SCALE:
         return ""
@@ -65,9 +74,11 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
 
 
 def _pose_of(graph: SceneGraph, node: mi.Object) -> np.ndarray | None:
-    """(4, 4); None while a function is being frozen."""
+    """(4, 4), or (N, 4, 4) where there are several; None while a function is being frozen."""
     matrix = on_host_or_none(graph.value(node, POSE).matrix)
-    return None if matrix is None else matrix.reshape(4, 4)
+    if matrix is None:
+        return None
+    return matrix.reshape(4, 4) if matrix.size == MATRIX_SIZE else np.moveaxis(matrix.reshape(4, 4, -1), -1, 0)
 
 
 def _inverts(graph: SceneGraph, shape: mi.Shape, matrix: np.ndarray) -> bool:
