@@ -155,7 +155,8 @@ SUPPORT = (
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
         "a bump map's slopes step at edges; where bent normals turn from the viewer is none: if the shape, the camera "
-        "or the map moves and half a per cent of what is seen of it is turned, as at the rim of a ball, warning"),
+        "or the map moves and half a per cent of what is seen of it is turned, or normals at a rim are bent by .01 "
+        "from the viewer, warning"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),

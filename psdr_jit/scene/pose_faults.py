@@ -26,7 +26,10 @@ _TURNED = (
     "a shapegroup and turn an instance of it"
 )
 
-_SEVERAL = "has a to_world of several matrices: assign one"
+_SEVERAL = (
+    "has a to_world of several matrices, as a variable that Dr.Jit has widened makes it: assign one, by way of "
+    "dr.opaque(mi.Float, 0), say"
+)
 
 #: Of one matrix.
 MATRIX_SIZE, MATRIX_AXES = 16, 2
