@@ -98,11 +98,7 @@ class Search:
 
 def _enough(pair: Pair, least: mi.Float, narrowest: float) -> mi.Float:
     """Width at which halving ends where these part. By the choice of a lobe: what is narrower is not looked into."""
-    return dr.select(
-        pair.moves,
-        dr.select(pair.chosen, dr.maximum(least, narrowest), least),
-        dr.maximum(least, AT_REST),
-    )
+    return dr.maximum(least, dr.select(pair.moves, dr.select(pair.chosen, mi.Float(narrowest), 0), AT_REST))
 
 
 def begun(at: Interval) -> mi.UInt32:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mitsuba as mi
 import numpy as np
 
@@ -31,8 +33,8 @@ _SEVERAL = (
     "dr.opaque(mi.Float, 0), say"
 )
 
-#: Of one matrix.
-MATRIX_SIZE, MATRIX_AXES = 16, 2
+#: Shape of one matrix.
+ONE = (4, 4)
 
 
 def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
@@ -42,7 +44,7 @@ def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
     matrix = _pose_of(graph, shape)
     if matrix is None:
         return ""
-    if matrix.ndim != MATRIX_AXES:
+    if matrix.shape != ONE:
         return _SEVERAL
     if plugin in MET_IN_OBJECT_SPACE:
         return "" if _inverts(graph, shape, matrix) else _ONE_WAY
@@ -65,7 +67,7 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
     matrix = _pose_of(graph, emitter)
     if matrix is None:
         return ""
-    if matrix.ndim != MATRIX_AXES:
+    if matrix.shape != ONE:
         return _SEVERAL
     axes = matrix[:3, :3]
     if np.abs(axes.T @ axes - np.eye(3)).max() <= UNEVEN_SCALE:
@@ -77,11 +79,9 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
 
 
 def _pose_of(graph: SceneGraph, node: mi.Object) -> np.ndarray | None:
-    """(4, 4), or (N, 4, 4) where there are several; None while a function is being frozen."""
+    """Of the shape `ONE`, unless there are several; None while a function is being frozen."""
     matrix = on_host_or_none(graph.value(node, POSE).matrix)
-    if matrix is None:
-        return None
-    return matrix.reshape(4, 4) if matrix.size == MATRIX_SIZE else np.moveaxis(matrix.reshape(4, 4, -1), -1, 0)
+    return matrix if matrix is None or matrix.size != math.prod(ONE) else matrix.reshape(ONE)
 
 
 def _inverts(graph: SceneGraph, shape: mi.Shape, matrix: np.ndarray) -> bool:
