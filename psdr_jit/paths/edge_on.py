@@ -105,6 +105,12 @@ class EdgeOn:
         n = mi.Normal3f(dr.sqrt(1 - GRAZING**2) * contact - dr.mulsign(GRAZING, cos) * d)
         si.n = dr.select(at_outline, dr.mulsign(mi.Float(1), dr.dot(si.n, n)) * n, si.n)
         si.p = dr.select(at_outline, si.p + radius * (contact - si.sh_frame.n), si.p)
-        si.sh_frame = dr.select(at_outline, mi.Frame3f(n), si.sh_frame)
+        si.sh_frame = dr.select(at_outline, _turned(si.sh_frame, n), si.sh_frame)
         si.wi = dr.select(at_outline, si.to_local(-d), si.wi)
         return si
+
+
+def _turned(frame: mi.Frame3f, n: mi.Normal3f) -> mi.Frame3f:
+    """`frame` with a normal `n` close to its own: what is brushed, or bent, is turned about it as before."""
+    s = dr.normalize(frame.s - n * dr.dot(n, frame.s))
+    return mi.Frame3f(s, dr.cross(n, s), n)

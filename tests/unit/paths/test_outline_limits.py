@@ -38,6 +38,20 @@ def test_normals_beside_an_outline_are_those_of_the_outline(llvm, shape, bsdf):
 
 
 @pytest.mark.parametrize("shape", ["sphere", "cylinder"])
+def test_frames_beside_an_outline_are_turned_as_they_were(llvm, shape):
+    """About the normal: what is brushed along a tangent, or bent by a map, was another thing at outlines."""
+    scene, d = scene_of(shape, {"type": "diffuse"}), mi.Vector3f(0.6, 0.8, 0)
+    beside = RADIUS * (1 - INSIDE) * mi.Vector3f(0.8, -0.6, 0)
+    ray = mi.Ray3f(mi.Point3f(beside - 5 * d) + [0, 0, 0 if shape == "sphere" else 0.2], d)
+    si = scene.ray_intersect(ray)
+    s = np.array(si.sh_frame.s)[:, 0]
+    frame = edge_on_of(scene).at_limit(si, d, mi.Bool(True)).sh_frame
+    n, s_there, t = (np.array(v)[:, 0] for v in (frame.n, frame.s, frame.t))
+    assert n[:2] @ [0.8, -0.6] == pytest.approx(1, abs=1e-5)
+    assert s_there == pytest.approx(s, abs=0.03) and t == pytest.approx(np.cross(n, s_there), abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cylinder"])
 def test_an_inner_wall_stays_as_it_is(llvm, shape):
     """Next to a rim it is met edge-on as well, but has no outline there: moved to one, it lay behind the outer wall."""
     scene = scene_of(shape, {"type": "twosided", "bsdf": {"type": "diffuse"}})
