@@ -65,7 +65,7 @@ def mesh_patterns(mesh: mi.Mesh, families: list[StepFamily], everywhere: bool) -
     faces, uv = np.array(mesh_faces(mesh)).T, texcoords(mesh)
     everywhere |= len(families) > 0 and not mesh.has_vertex_texcoords()
     found = parallel_lines(families, uv.reshape(-1, 2))
-    patches = _face_patches(uv)
+    patches = face_patches(uv, int(np.ceil(np.sqrt(LEAST_PATCHES / max(len(uv), 1)))))
     # q = (uv − uv_0) J⁻¹; the pseudo-inverse where a face has no area in texture coordinates
     inverse = np.linalg.pinv(np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], 1), rcond=FLAT)
     parts = []
@@ -74,18 +74,13 @@ def mesh_patterns(mesh: mi.Mesh, families: list[StepFamily], everywhere: bool) -
         rows |= {f"v{i}": faces[rows["part"], i] for i in range(3)}
         parts.append((lines, rows))
     on_sides = np.full((len(faces), 3), True) if everywhere else sides_on_lines(uv, found)
-    return ShapePatterns(parts, uploaded(mi.Bool, on_sides) if on_sides.any() else None, _front(mesh))
+    return ShapePatterns(parts, uploaded(mi.Bool, on_sides) if on_sides.any() else None, winding(mesh))
 
 
 def analytic_patterns(plugin: str, families: list[StepFamily]) -> ShapePatterns:
     """Lines on a shape without triangles."""
-    nu, nv = ANALYTIC_GRID[plugin]
-    u, v = (a.ravel() for a in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
-    corner = np.stack([u, v], 1)[:, None]
-    halves = (np.array([[0, 0], [1, 0], [0, 1]]), np.array([[1, 1], [0, 1], [1, 0]]))
-    uv = np.concatenate([corner + half for half in halves]) / np.array([nu, nv])
-    patches = Patches(uv, uv, np.full(len(uv), int(SURFACES[plugin])))
-    parts = []
+    patches, parts = body_patches(plugin, ANALYTIC_GRID[plugin]), []
+    uv = patches.uv
     for lines in parallel_lines(families, uv.reshape(-1, 2), ENDS[plugin]):
         rows = rows_on(patches, None, lines, np.broadcast_to(lines.n, (len(uv), 2)))
         rows |= {f"v{i}": np.zeros(len(rows["part"])) for i in range(3)}
@@ -93,9 +88,18 @@ def analytic_patterns(plugin: str, families: list[StepFamily]) -> ShapePatterns:
     return ShapePatterns(parts, None, 0.0)
 
 
-def _face_patches(uv: np.ndarray) -> Patches:
+def body_patches(plugin: str, grid: tuple[int, int]) -> Patches:
+    """A shape without triangles, in two patches for each cell of a `grid` along both texture coordinates."""
+    nu, nv = grid
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
+    corner = np.stack([u, v], 1)[:, None]
+    halves = (np.array([[0, 0], [1, 0], [0, 1]]), np.array([[1, 1], [0, 1], [1, 0]]))
+    uv = np.concatenate([corner + half for half in halves]) / np.array([nu, nv])
+    return Patches(uv, uv, np.full(len(uv), int(SURFACES[plugin])))
+
+
+def face_patches(uv: np.ndarray, n: int) -> Patches:
     """Faces with texture coordinates (F, 3, 2), each cut into n² triangles."""
-    n = max(1, int(np.ceil(np.sqrt(LEAST_PATCHES / max(len(uv), 1)))))
     i, j = (a.ravel() for a in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
     lower, upper = i + j < n, i + j < n - 1
     corner = np.stack([i, j], 1)
@@ -111,8 +115,8 @@ def _face_patches(uv: np.ndarray) -> Patches:
     return Patches(origin + b[:, :, 0] * sides[0] + b[:, :, 1] * sides[1], q, part)
 
 
-def _front(mesh: mi.Mesh) -> float:
-    """`ShapePatterns.front`: by the normal that Mitsuba gives the first face."""
+def winding(mesh: mi.Mesh) -> float:
+    """`ShapePatterns.front`, by the normal that Mitsuba gives the first face."""
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.t, pi.prim_uv, pi.valid = mi.Float(0), mi.Point2f(1 / 3), mi.Bool(True)
     pi.shape = mi.ShapePtr(mesh)

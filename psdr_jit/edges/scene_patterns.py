@@ -13,9 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.compat import faces_buffer, same_values, texcoords_buffer
-from ..core.joining import joined, pointers
+from ..core.joining import pointers
 from ..core.memory import Memory, Slot
-from ..core.sensor_frame import origin_box
 from ..core.upload import uploaded
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
@@ -36,10 +35,9 @@ from .joined_meshes import attached_positions
 from .kind import EdgeKind
 from .kind_curve_pattern import RodPatterns, TubePatterns
 from .kind_pattern import AnalyticPatterns, MeshPatterns
-from .overlaps import apart
 from .pattern_rows import MOST_LINES, PatternSet, pattern_set, too_fine
 from .pattern_shapes import ShapePatterns, analytic_patterns, mesh_patterns, texture_reach
-from .segments import known_topology
+from .seen_sides import seen_sides
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,8 @@ def pattern_kinds(
         if lines is None:
             continue
         moves = _moves(chosen, lines)
-        front, back = _seen_sides(job, chosen, found, lines)
+        fronts = [0.0 if patterns is None else patterns.front for patterns in found]
+        front, back = seen_sides(job, chosen, fronts, lines.rows.shape, lines.rows.part)
         common = (pointers(mi.ShapePtr, shapes), centre, tuple(shapes))
         if family == MESH:
             positions = dr.detach(attached_positions(tuple(shapes)))
@@ -205,34 +204,3 @@ def _lines(memory: Memory, found: list[ShapePatterns | None], counts: list[int],
             dr.eval(known.lines.rows, known.lines.s, known.lines.inset)
         memory[TABLES][family] = known
     return known.lines
-
-
-def _seen_sides(
-    job: Job, chosen: list[ShapeFacts], found: list[ShapePatterns | None], lines: PatternSet
-) -> tuple[mi.Float, mi.Float]:
-    """By row: can the side of the face that its winding calls the front be seen at all, and the other? 0 or 1.
-
-    Not the inner side of a closed opaque shape that nobody is in, nor the back of a one-sided material; nothing of
-    faces that repeat others.
-    """
-    lower, upper = origin_box(job.frame)
-    shapes, fronts, shells, firsts, first = edge_shapes(job).shapes, [], [], [], 0
-    topologies = [known_topology(shapes[s.index], job.call.memory) if s.is_mesh else None for s in chosen]
-    for facts, patterns, topology in zip(chosen, found, topologies, strict=True):
-        shape = shapes[facts.index]
-        outside = float(facts.opaque and apart(lower, upper, shape.bbox()))
-        one_sided = facts.is_mesh and not facts.smooth and not facts.bsdf_flags & int(mi.BSDFFlags.BackSide)
-        fronts.append(patterns.front if one_sided and patterns is not None else 0.0)
-        shells.append(outside * (topology.facing if topology else mi.Float(facts.plugin == "sphere")))
-        firsts.append(first)
-        first += facts.faces if facts.is_mesh else 1
-    rows, are_meshes = lines.rows, any(facts.is_mesh for facts in chosen)
-    face = dr.gather(mi.UInt32, uploaded(mi.UInt32, np.array(firsts)), rows.shape)
-    part = face + rows.part if are_meshes else face
-    closed = dr.gather(mi.Float, joined(shells), part)
-    there = mi.Bool(True)
-    if not all(topology is None or topology.keeps_all for topology in topologies):
-        there = dr.gather(mi.Bool, joined([t.kept if t else mi.Bool(True) for t in topologies]), part)
-    side = dr.gather(mi.Float, uploaded(mi.Float, np.array(fronts)), rows.shape)
-    front = dr.select((closed < 0) | (side < 0) | ~there, mi.Float(0), 1)
-    return front, dr.select((closed > 0) | (side > 0) | ~there, mi.Float(0), 1)
