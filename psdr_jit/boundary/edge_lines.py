@@ -18,6 +18,7 @@ from ..core.records import Hit
 from ..core.streams import Stream, stream_seed
 from ..edges.followed_lights import followed_lights
 from ..edges.kind import Line, OnEdge, Sight
+from ..paths.bounce import PathLimits
 from ..paths.rays import ROUNDING
 from ..paths.recording import RadianceByDepth
 from ..paths.walk import walk
@@ -141,14 +142,15 @@ def slots(records: SubpathRecords, kept: mi.UInt32) -> mi.UInt32:
     return slot
 
 
-def radiance_by_depth(job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, vertices: int, active: mi.Bool, emission: mi.Bool):
+def radiance_by_depth(
+    job: Job, ray: mi.Ray3f, pi, lane: mi.UInt32, limits: PathLimits, active: mi.Bool, emission: mi.Bool
+):
     """Radiance along `ray`, by depth: `(by_depth, of the whole path)`.
 
     `lane`: picks the random numbers. `emission`: lanes that count what the first vertex emits.
     """
     rng = lane_sampler(stream_seed(job.seed, Stream.INDIRECT_RADIANCE), lane)
-    by_depth = RadianceByDepth(dr.width(lane), vertices)
-    limits = replace(job.limits_beside, max_depth=vertices)
+    by_depth = RadianceByDepth(dr.width(lane), limits.max_depth)
     final, _, _ = walk(job.scene, rng, ray, pi, limits, by_depth, emission, active)
     dr.eval(final, by_depth.values, by_depth.reached)
     return by_depth, final
@@ -177,8 +179,8 @@ def arriving(job: Job, view: EdgeView, source: Hit, records: SubpathRecords) -> 
     past = dr.gather(_Past, _Past(view.lane, source, view.wavelengths), kept)
     dr.eval(past)  # in one kernel, see `compact`
     ray = mi.Ray3f(past.source.o, past.source.d, 0, past.wavelengths)
-    pi, vertices = past.source.intersection(), longest_path(job) + 1
-    by_depth, final = radiance_by_depth(job, ray, pi, past.lane, vertices, mi.Bool(True), mi.Bool(False))
+    pi, limits = past.source.intersection(), replace(job.limits_beside, max_depth=longest_path(job) + 1)
+    by_depth, final = radiance_by_depth(job, ray, pi, past.lane, limits, mi.Bool(True), mi.Bool(False))
     needed = dr.gather(mi.Bool, useful, lane)
     slot = dr.gather(mi.UInt32, slot, lane)
     return dr.select(needed, by_depth.up_to(left, slot, dr.gather(mi.Spectrum, final, slot, needed)), 0)

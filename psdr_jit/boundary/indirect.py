@@ -108,7 +108,8 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     followed = is_followed(job, pi.shape.emitter(), differs & pi.is_valid())
     # the emission of others is seen by delta lobes, and taken off again for smooth ones
     emission = mi.Bool(True) if job.facts.has_delta_lobes else followed
-    return *radiance_by_depth(job, ray, pi, v.lane, vertices, differs, emission), followed
+    limits = replace(job.limits_beside, max_depth=vertices).looking_within(table.within_surfaces(v.sight.at.row))
+    return *radiance_by_depth(job, ray, pi, v.lane, limits, differs, emission), followed
 
 
 #: What its lines are drawn for, by form.

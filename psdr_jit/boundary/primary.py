@@ -129,7 +129,8 @@ def trace_sides(job: Job, edges: FilmEdges, sample: EdgeSample):
     if job.options.hide_emitters:
         ray, pi = see_through_emitters(job.scene, ray, pi)
         emission = mi.Bool(False)
-    L, _, surface = walk(job.scene, rng, ray, pi, job.limits_beside, NoSink(), emission, differs)
+    limits = job.limits_beside.looking_within(edges.table.within_surfaces(s.row))
+    L, _, surface = walk(job.scene, rng, ray, pi, limits, NoSink(), emission, differs)
     L *= weight
     alpha = mi.Float(1) if job.sky_is_seen else dr.select(surface, mi.Float(1), 0)
     alpha += dr.zeros(mi.Float, 2 * n)  # full width, whatever it is made of

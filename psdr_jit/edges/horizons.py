@@ -101,6 +101,10 @@ class Horizons:
         """As of `EdgeTable`: nothing depends on the direction."""
         return mi.Vector3f(0)
 
+    def within_surfaces(self, row: mi.UInt32) -> mi.Bool | None:
+        """As of `EdgeTable`: no horizon does."""
+        return None
+
     def side(self, sight: Sight, which: mi.UInt32) -> Side:
         """Above or below the face: whatever a ray meets."""
         return Side.found_by(sight.beside(which))

@@ -156,6 +156,7 @@ class EdgeKind(ABC):
     """One family of discontinuities."""
 
     blocks_light: ClassVar[bool] = True  # do shadow rays notice it at all?
+    near_outlines: ClassVar[bool] = False  # may it lie so close to an outline that it must not be taken for one?
     shades_only: ClassVar[bool] = False  # does only what one surface sends step there, not its place or normal?
 
     @property

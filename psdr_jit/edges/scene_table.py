@@ -47,6 +47,7 @@ from .kind_tube import TubeOutlines, tube_rows
 from .overlaps import apart, box_of, crossing, warn_about_pairs
 from .rod_rows import rod_rows
 from .rows import EdgeRows
+from .scene_bent import bent_kinds
 from .scene_grids import scene_grids
 from .scene_patterns import pattern_kinds, patterns_of
 from .segments import EdgeSet, edge_set
@@ -107,6 +108,7 @@ def edge_table(job: Job) -> EdgeTable:
         kinds += _grid_edges(job, grids, centre)
     kinds += _shading_outlines(job, meshes, centre)
     kinds += pattern_kinds(job, meshes, analytic, centre)
+    kinds += bent_kinds(job, meshes, analytic, centre)
     on_rims = standing(shapes, chosen) if job.options.form == "material" else []
     contacts = touching(straight, on_rims, job.facts.camera_moves, job.call.memory)
     return EdgeTable(tuple(kinds), hidden, contacts)

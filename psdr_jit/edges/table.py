@@ -55,6 +55,12 @@ class EdgeTable:
             first += kind.count
         return answer
 
+    def within_surfaces(self, row: mi.UInt32) -> mi.Bool | None:
+        """Which of these edges are steps inside of a surface that may lie close to its outline; None: no kind does."""
+        if not any(kind.near_outlines for kind in self.kinds):
+            return None
+        return self.ask(row, lambda kind, _, own: own & kind.near_outlines)
+
     def weights(self, of: Callable[[EdgeKind], mi.Float]) -> list[mi.Float]:
         """By kind, the column `of` its rows."""
         return [of(kind) for kind in self.kinds]

@@ -48,6 +48,12 @@ class PathLimits:
         """How directions are sampled."""
         return Mixture(self.uniform_share, self.critical, self.aim)
 
+    def looking_within(self, within: mi.Bool | None) -> PathLimits:
+        """Limits of walks from beside edges that are, where `within`, steps inside of a surface; None: nowhere."""
+        if within is None or self.edge_on is None:
+            return self
+        return replace(self, edge_on=replace(self.edge_on, within=within))
+
     def beyond(self, k: mi.UInt32) -> PathLimits:
         """Limits of paths that have `k` segments behind them already, lane by lane."""
         return replace(self, max_depth=mi.UInt32(self.max_depth) - k)

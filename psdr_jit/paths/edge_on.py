@@ -69,6 +69,7 @@ class EdgeOn:
     radius: mi.Float  # [m]
     centre: mi.Point3f  # of a cylinder: on its axis
     axis: mi.Vector3f  # of a cylinder, of unit length; 0 of a sphere
+    within: mi.Bool | None = None  # by lane, if known: a step inside of a surface, which is seen as it is
 
     @staticmethod
     def of(scene: mi.Scene, facts: SceneFacts) -> EdgeOn | None:
@@ -94,6 +95,8 @@ class EdgeOn:
         code = dr.reinterpret_array(mi.UInt32, si.shape)
         cos = dr.dot(si.sh_frame.n, -d)
         at_outline = active & si.is_valid() & (dr.abs(cos) < BESIDE)
+        if self.within is not None:
+            at_outline &= ~self.within
         place = dr.gather(mi.UInt32, self.place, code, at_outline & (code < dr.width(self.place)))
         at_outline &= place != 0
         axis = dr.gather(mi.Vector3f, self.axis, place - 1, at_outline)

@@ -1,8 +1,9 @@
-"""Bent normals that turn from the sensor: where they begin to, what a bump or normal map sends there steps.
+"""Bent normals that turn from the sensor where no edge stands for the curves at which that begins.
 
-Mitsuba then turns them over (`flip_invalid_normals`), or the nested BSDF ends. No edge stands for the curves within
-texels at which that begins. Maps that are steep for how they are looked at are named where these curves move: with the
-shape, with the camera, and with the map itself.
+Mitsuba turns them over there (`flip_invalid_normals`), or the nested BSDF ends: what a bump or normal map sends steps.
+Edges stand for that on meshes, disks, cylinders and spheres (`edges.kind_bent`) as they move. Named are maps that are
+differentiated themselves, maps within maps, and those of curves, grids and ellipsoids, if they are steep for how they
+are looked at.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from ..core.memory import Memory
 from ..core.sensor_frame import sensor_frame
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
-from .delta_lobes import BENT_NORMALS
-from .facts import SceneFacts
-from .graph import child_objects, plugin_name
+from .bent_normals import BentMap, bent_maps, nested_maps
+from .facts import SceneFacts, ShapeFacts
+from .names import plugin_name
 from .sight_lines import first_hits, lines_of_sight
 
 #: Share of what is seen of a shape that may be turned away: a sheet with 2 % was 7 % off, a ball with 0.8 % by 9 %.
@@ -35,55 +36,56 @@ AT_RIM, RIM_SHARE = 0.1, 0.003
 TURNED_AT_RIM = 0.01
 
 
+#: Kinds of shapes on which edges stand for the curves.
+WITH_EDGES = ("mesh", "analytic")
+
+
 def warn_about_bent_normals(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Name shapes of which the sensor sees many points whose bent normals turn from it, once each."""
-    shapes = scene.shapes()
-    all_move = facts.view_moves
-    bent = [(s, maps) for s in facts.shapes if s.index >= 0 and (maps := _maps(shapes[s.index].bsdf()))
-            and (all_move or s.moves or s.shading or any(map(_changes, maps)))]  # fmt: skip
+    bent = [(shape, why, maps) for shape in facts.shapes if shape.index >= 0
+            and (maps := bent_maps(scene.shapes()[shape.index].bsdf()))
+            and (why := _without_edges(shape, maps, facts.view_moves or shape.moves))]  # fmt: skip
     if not bent:
         return
     o, d, _, _ = lines_of_sight(scene, sensor_frame(sensor))
     ray, pi, number = first_hits(scene, o, d)
-    for shape, maps in bent:
+    for shape, why, maps in bent:
         met = number == shape.index + 1
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, met)
-        normals = [_bent(si, node, met) for node in maps]
+        normals = [bent.normal(si, met) for bent in maps]
+        name = f"{plugin_name(maps[0].node)} of shape '{shape.name}'"
         share = max(_turned_share(si, n, met) for n in normals)
         if share > TURNED_SHARE:
             warn_once(
-                f"the {plugin_name(maps[0])} of shape '{shape.name}' turns normals from the sensor on {share:.1%} of "
-                "what is seen of it: where they begin to, the image steps, and this part of the derivative is missing, "
-                "a tenth of it with 1 % at the rim of a ball; use a map that is less steep",
+                f"the {name} turns normals from the sensor on {share:.1%} of what is seen of it: where they begin to, "
+                f"the image steps, and as {why}, this part of the derivative is missing, a tenth of it with 1 % at the "
+                "rim of a ball; use a map that is less steep",
                 UnsupportedWarning, memory,
             )  # fmt: skip
             continue
         turned = max(_turned_at_rim(si, n, met) for n in normals)
         if turned > TURNED_AT_RIM:
             warn_once(
-                f"the {plugin_name(maps[0])} of shape '{shape.name}' bends normals at its rim from the sensor, by "
-                f"{turned:.2f} as a mean of sines: where they turn away, just inside of the rim, the image steps, and "
-                "this part of the derivative is missing, 1 to 3 % where that is .02, 5 to 6 % where it is .03; use a "
-                "map that is less steep",
+                f"the {name} bends normals at its rim from the sensor, by {turned:.2f} as a mean of sines: where they "
+                f"turn away, just inside of the rim, the image steps, and as {why}, this part of the derivative is "
+                "missing, 1 to 3 % where that is .02, 5 to 6 % where it is .03; use a map that is less steep",
                 UnsupportedWarning, memory,
             )  # fmt: skip
 
 
-def _changes(node: mi.BSDF) -> bool:
+def _without_edges(shape: ShapeFacts, maps: list[BentMap], moves: bool) -> str:
+    """Why curves move for which no edges stand; "" if none do."""
+    inner = [found for bent in maps for found in nested_maps(bent)]
+    if any(map(_changes, maps + inner)):
+        return "the map itself is differentiated"
+    if moves and inner:
+        return "it holds another map"
+    return f"it is on a shape of plugin '{shape.plugin}'" if moves and shape.kind not in WITH_EDGES else ""
+
+
+def _changes(bent: BentMap) -> bool:
     """Is a bump or normal map itself differentiated?"""
-    return any(dr.grad_enabled(value) for _, value in mi.traverse(_texture(node)) if dr.is_diff_v(value))
-
-
-def _texture(node: mi.BSDF) -> mi.Texture:
-    return next(child for child in child_objects(node) if isinstance(child, mi.Texture))
-
-
-def _maps(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
-    """The bump and normal maps below a BSDF."""
-    if not isinstance(bsdf, mi.BSDF):
-        return []
-    own = [bsdf] if plugin_name(bsdf) in BENT_NORMALS else []
-    return own + [found for child in child_objects(bsdf) for found in _maps(child)]
+    return any(dr.grad_enabled(value) for _, value in mi.traverse(bent.texture) if dr.is_diff_v(value))
 
 
 def _turned_share(si: mi.SurfaceInteraction3f, n: mi.Normal3f, met: mi.Bool) -> float:
@@ -108,15 +110,3 @@ def _turned_at_rim(si: mi.SurfaceInteraction3f, n: mi.Normal3f, met: mi.Bool) ->
 def _sum(values: mi.Float | mi.Bool) -> float:
     """On the host; of a mask, how often it is set."""
     return float(np.array(dr.sum(dr.select(values, 1.0, 0.0) if dr.is_mask_v(values) else values)).ravel()[0])
-
-
-def _bent(si: mi.SurfaceInteraction3f, node: mi.BSDF, met: mi.Bool) -> mi.Normal3f:
-    """The bent normal in the shading frame, before Mitsuba turns it [Mitsuba 3.9.1, `bumpmap.cpp`, `normalmap.cpp`]."""
-    texture = _texture(node)
-    if plugin_name(node) == "normalmap":
-        return mi.Normal3f(dr.normalize(2 * mi.Vector3f(texture.eval_3(si, met)) - 1))
-    slope = mi.traverse(node)["scale"] * texture.eval_1_grad(si, met)
-    n = si.sh_frame.n
-    across = dr.cross(si.dp_du + n * (slope.x - dr.dot(n, si.dp_du)), si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv)))
-    across *= dr.select(dr.dot(si.n, across) < 0, -1.0, 1.0)
-    return mi.Normal3f(si.to_local(dr.normalize(across)))

@@ -17,6 +17,7 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.edges.kind import ContourKind, EdgeKind, FixedKind, Sight, Use
 from psdr_jit.edges.kind_analytic import AnalyticCurves
+from psdr_jit.edges.kind_bent import BentOutlines
 from psdr_jit.edges.kind_curve_pattern import RodPatterns, TubePatterns
 from psdr_jit.edges.kind_ellipsoid import EllipsoidOutlines
 from psdr_jit.edges.kind_grid import GridEdges
@@ -54,11 +55,22 @@ def blended_grid() -> mi.Scene:
     return scene_io.load_scene(scene_io.shipped_scene("grid_shadow.xml"), res=16, normals="smooth")
 
 
+def bent_ball() -> mi.Scene:
+    """A ball with a normal map."""
+    bent = np.random.default_rng(1).uniform(0.3, 0.7, (5, 5, 3)).astype(np.float32) + np.array([0, 0, 0.3], np.float32)
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(bent), "raw": True}
+    ball = {"type": "sphere", "bsdf": {"type": "normalmap", "normalmap": picture, "bsdf": {"type": "diffuse"}}}
+    pose = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": pose}
+    return mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant"}, "sensor": sensor}, optimize=False)
+
+
 PLACES = {  # kind: a scene that has it, and what moves there
     MeshEdges: ("lit_box", ["box.vertex_positions"]),
     Junctions: ("sunk_box", ["box.vertex_positions", "floor.vertex_positions"]),
     AnalyticCurves: ("ball_shadow", ["blocker.to_world"]),
     ShadingOutlines: ("smooth_mesh", ["ball.vertex_positions"]),
+    BentOutlines: (bent_ball, ["ball.to_world"]),
     MirrorHorizons: (mirror_ball, ["ball.vertex_positions"]),
     MeshPatterns: ("patterns", ["floor.to_world"]),
     AnalyticPatterns: ("patterns", ["ball.to_world"]),
@@ -164,7 +176,7 @@ def test_everything_shifted_shifts_the_edge(found):
     params, θ = mi.traverse(job.scene), mi.Float(0)
     dr.enable_grad(θ)
     still = ("camera", "light", "lamp")
-    for name in [k for k in params.keys() if k.endswith(PLACED) and not k.startswith(still)]:
+    for name in [k for k in params.keys() if k.endswith(PLACED) and not k.startswith(still) and "bsdf" not in k]:
         params[name] = moved(params[name], θ, STRIDES.get(name.split(".")[-1], 3))
     params.update()
     dr.forward(θ, dr.ADFlag.ClearEdges)

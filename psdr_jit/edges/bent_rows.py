@@ -1,0 +1,144 @@
+"""Patches of surfaces with bump or normal maps, as rows of an edge table.
+
+Which patches there are depends on texture coordinates and the sizes of pictures alone: it is kept while shapes move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.compat import faces_buffer, mesh_faces, same_values, texcoords_buffer
+from ..core.memory import Memory, Slot
+from ..core.upload import uploaded
+from ..scene.bent_normals import BentMap, bent_maps
+from ..scene.facts import ShapeFacts
+from ..scene.names import plugin_name
+from .pattern_rows import Patches
+from .pattern_shapes import body_patches, face_patches, texcoords, winding
+
+
+@dataclass
+class BentRows:
+    """One entry per row; detached device arrays."""
+
+    shape: mi.UInt32  # index into the shapes of the kind
+    part: mi.UInt32  # the face of a mesh, or which sort of shape
+    map: mi.UInt32  # index into the maps of the kind
+    v0: mi.UInt32  # of a mesh: the corners of its face, by global vertex index
+    v1: mi.UInt32
+    v2: mi.UInt32
+    q0: mi.Point2f  # corners of the patch in the surface's own coordinates
+    q1: mi.Point2f
+    q2: mi.Point2f
+    texels: mi.Float  # of the map, from one end of the patch to the other
+    front: mi.Bool  # may it be looked at from the side of its normals (`BentSurface.normal`)?
+    back: mi.Bool  # and from the other one?
+    mirrored: mi.Bool  # as of `BentMap`
+    moves: mi.Bool  # can the shape move?
+
+    def q(self, b: mi.Point2f) -> mi.Point2f:
+        """The point b of the patches, in the surface's own coordinates."""
+        return mi.Point2f(self.q0 + b.x * (self.q1 - self.q0) + b.y * (self.q2 - self.q0))
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The patches of a shape, and what they were made from."""
+
+    buffers: list
+    sizes: list[np.ndarray]  # of maps, as of `_scale`
+    patches: Patches
+
+    def is_of(self, buffers: list, sizes: list[np.ndarray]) -> bool:
+        same = len(sizes) == len(self.sizes) and all(map(np.array_equal, sizes, self.sizes))
+        return same and all(same_values(a, b) for a, b in zip(self.buffers, buffers, strict=True))
+
+
+#: Patches of a shape: at least; and at most, until when they are as small as texels.
+LEAST_PATCHES, MOST_PATCHES = 4096, 2**16
+
+#: Of an integrator: patches by name of the shape.
+PATCHES: Slot[dict[str, _Known]] = Slot(dict)
+
+
+def bent_rows(chosen: list[tuple[mi.Shape, ShapeFacts]], memory: Memory) -> tuple[BentRows, tuple[BentMap, ...]]:
+    """Rows of `chosen` shapes with maps, all of them meshes or none, and their maps. `front` and `back` are as the BSDF
+    has them.
+    """
+    maps: list[BentMap] = []
+    columns: dict[str, list[np.ndarray]] = {}
+    first = 0
+    for number, (shape, facts) in enumerate(chosen):
+        own_maps = bent_maps(shape.bsdf())
+        patches, corners = _patches(shape, facts, own_maps, memory), None
+        if facts.is_mesh:
+            corners = np.array(mesh_faces(shape)).T[patches.part] + first
+            first += shape.vertex_count()
+        for bent in own_maps:
+            turned = facts.is_mesh and winding(shape) < 0
+            own = _columns(patches, corners) | {
+                "texels": _texels(bent.texture, patches.uv),
+                "shape": number, "map": len(maps), "mirrored": bent.mirrored, "moves": facts.moves,
+                "front": bent.back if turned else bent.front, "back": bent.front if turned else bent.back,
+            }  # fmt: skip
+            for name, values in own.items():
+                alike = np.broadcast_to(values, len(patches.part)) if np.ndim(values) == 0 else values
+                columns.setdefault(name, []).append(alike)
+            maps.append(bent)
+    return BentRows(**{name: _on_device(name, np.concatenate(parts)) for name, parts in columns.items()}), tuple(maps)
+
+
+def _columns(patches: Patches, corners: np.ndarray | None) -> dict[str, np.ndarray]:
+    count = len(patches.part)
+    corners = np.zeros((count, 3), int) if corners is None else corners
+    own = {f"v{k}": corners[:, k] for k in range(3)} | {f"q{k}": patches.q[:, k] for k in range(3)}
+    return own | {"part": patches.part}
+
+
+def _on_device(name: str, values: np.ndarray):
+    if values.ndim == 2:
+        return mi.Point2f(*(uploaded(mi.Float, values[:, axis]) for axis in range(2)))
+    if values.dtype == bool:
+        return uploaded(mi.Bool, values)
+    return uploaded(mi.Float if name == "texels" else mi.UInt32, values)
+
+
+def _patches(shape: mi.Shape, facts: ShapeFacts, maps: list[BentMap], memory: Memory) -> Patches:
+    textures = [bent.texture for bent in maps]
+    buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
+    known, sizes = memory[PATCHES].get(facts.name), [_scale(texture) for texture in textures]
+    if known is None or not known.is_of(buffers, sizes):
+        known = _Known(buffers, sizes, _cut(shape, facts, textures))
+        memory[PATCHES][facts.name] = known
+    return known.patches
+
+
+def _cut(shape: mi.Shape, facts: ShapeFacts, textures: list[mi.Texture]) -> Patches:
+    """A shape in patches, about as small as texels."""
+    if not facts.is_mesh:
+        whole = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
+        cells = max(float(_texels(texture, whole)[0]) for texture in textures) ** 2
+        side = int(np.ceil(np.sqrt(np.clip(2 * cells, LEAST_PATCHES, MOST_PATCHES) / 2)))
+        return body_patches(facts.plugin, (side, side))
+    uv = texcoords(shape)
+    cells = sum(np.max([_texels(texture, uv) for texture in textures], 0) ** 2)
+    wanted = np.clip(cells, LEAST_PATCHES, MOST_PATCHES)
+    return face_patches(uv, max(1, int(np.sqrt(wanted / max(len(uv), 1)))))
+
+
+def _scale(texture: mi.Texture) -> np.ndarray:
+    """Texels per unit of texture coordinates, (2, 2); 0 where there are none."""
+    if plugin_name(texture) != "bitmap":
+        return np.zeros((2, 2))
+    params = mi.traverse(texture)
+    height, width = dr.shape(params["data"])[:2]
+    return np.array(params["to_uv"].matrix, float)[:2, :2] * np.array([[width], [height]])
+
+
+def _texels(texture: mi.Texture, uv: np.ndarray) -> np.ndarray:
+    """How many texels patches with texture coordinates (P, 3, 2) are long or wide."""
+    return np.abs((uv - np.roll(uv, 1, 1)) @ _scale(texture).T).max((1, 2))

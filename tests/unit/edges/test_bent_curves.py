@@ -1,0 +1,74 @@
+"""Where bent normals turn from a viewpoint: points of these curves, and what they weigh."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from variants import also
+
+from psdr_jit.core.sensor_frame import viewpoint
+from psdr_jit.derivative import integrator_specs
+from psdr_jit.driver.prepare import prepare
+from psdr_jit.edges.bent_rows import BentRows
+from psdr_jit.edges.kind_bent import BentOutlines
+from psdr_jit.edges.scene_table import scene_edges
+from psdr_jit.scene.params import also_enabled
+
+GRID = 24  # of the midpoint rule, on every patch
+BAND = 0.01  # of h around the curve
+PER_ROW = 64  # samples of a patch
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+
+def outlines(plugin: str, texels: int) -> tuple[BentOutlines, mi.Vector4f]:
+    """Of a shape below a normal map, and where it is seen from."""
+    n = np.random.default_rng(2).uniform(-0.3, 0.3, (texels, texels, 3))
+    image = mi.Bitmap((n * [1, 1, 0] + [0.5, 0.5, 0.9]).astype(np.float32))
+    picture = {"type": "bitmap", "bitmap": image, "raw": True}
+    bsdf = {"type": "normalmap", "normalmap": picture, "bsdf": {"type": "diffuse"}}
+    pose = mi.ScalarTransform4f().look_at([2.4, 0.3, 1.2], [0, 0, 0], [0, 0, 1])
+    sensor = {"type": "perspective", "to_world": pose, "film": {"type": "hdrfilm", "width": 16, "height": 16}}
+    body = {"type": plugin, "bsdf": {"type": "twosided", "of": bsdf}}
+    scene = mi.load_dict({"type": "scene", "body": body, "sky": {"type": "constant"}, "sensor": sensor}, optimize=False)
+    integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppc": 1})
+    with also_enabled(scene, ["body.to_world"]):
+        job = prepare(integrator.call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]
+        (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, BentOutlines))
+    return kind, viewpoint(job.frame, mi.Point2f(0.5))
+
+
+def inside_band(kind: BentOutlines, view: mi.Vector4f) -> float:
+    """∫ δ(h) dA over all patches, as the area of |h| < BAND divided by 2 BAND; of what faces the viewer."""
+    i = dr.arange(mi.UInt32, kind.count * GRID**2)
+    row, k = i // GRID**2, i % GRID**2
+    b = mi.warp.square_to_uniform_triangle((mi.Point2f(k % GRID, k // GRID) + 0.5) / GRID)
+    rows, everywhere = dr.gather(BentRows, kind.rows, row), mi.Bool(True)
+    h = kind.surface.height(rows, kind.surface.bent(rows, b, everywhere), view)
+    place = kind.surface.place(rows, rows.q(b), everywhere)
+    area = dr.norm(dr.cross(place.towards(rows.q1 - rows.q0), place.towards(rows.q2 - rows.q0))) / (2 * GRID**2)
+    towards = mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(place.x)
+    faces = dr.dot(kind.surface.normal(rows, place), towards) > 0
+    inside = (dr.abs(h) < BAND) & (faces & rows.front | ~faces & rows.back)
+    return float(dr.sum(dr.select(inside, area, 0))[0]) / (2 * BAND)
+
+
+@pytest.mark.parametrize(("plugin", "texels"), [
+    ("rectangle", 3), also("rectangle", 150), ("sphere", 5), also("sphere", 100), also("cylinder", 4), also("disk", 5),
+])  # fmt: skip
+def test_points_and_what_they_weigh(plugin, texels):
+    """Points lie on the curve, and the sum of their weights is ∫ δ(h) dA; patches are small against texels, or not."""
+    kind, view = outlines(plugin, texels)
+    i = dr.arange(mi.UInt32, kind.count * PER_ROW)
+    row, t = i // PER_ROW, (mi.Float(i % PER_ROW) + mi.PCG32(dr.width(i)).next_float32()) / PER_ROW
+    on = kind.on(row, t, view, mi.Bool(True))
+    rows, b = dr.gather(BentRows, kind.rows, row), mi.Point2f(on.local.x, on.local.y)
+    h = kind.surface.height(rows, kind.surface.bent(rows, b, on.valid), view)
+    assert np.abs(np.array(dr.select(on.valid, h, 0))).max() < 1e-3
+    towards = mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(on.x)
+    m = kind.surface.at(rows, b, on.local.z, on.valid).gradient(-dr.normalize(towards))
+    weight = dr.select(on.valid, dr.norm(on.dx) / dr.norm(m), 0)
+    found, expected = float(dr.sum(weight)[0]) / PER_ROW, inside_band(kind, view)
+    assert expected > 0.05 and found == pytest.approx(expected, rel=0.03)
