@@ -58,38 +58,69 @@ class _Known:
         return same and all(same_values(a, b) for a, b in zip(self.buffers, buffers, strict=True))
 
 
-#: Patches of a shape: at least; and at most, until when they are as small as texels.
+@dataclass(frozen=True)
+class _Table:
+    """Rows, and what they were made from: patches and maps, kept alive, by shape, and which shapes move."""
+
+    made_from: tuple[list, list[BentMap], list[bool]]
+    rows: BentRows
+
+    def is_of(self, patches: list[Patches], maps: list[BentMap], moves: list[bool]) -> bool:
+        same = [id(p) for p in patches] == [id(p) for p in self.made_from[0]]
+        same &= [id(m.node) for m in maps] == [id(m.node) for m in self.made_from[1]]
+        return same and moves == self.made_from[2]
+
+
+#: Patches of all shapes together, about: at least; and at most, until when they are as small as texels. No fewer than
+#: faces.
 LEAST_PATCHES, MOST_PATCHES = 4096, 2**16
 
 #: Of an integrator: patches by name of the shape.
 PATCHES: Slot[dict[str, _Known]] = Slot(dict)
 
+#: Of an integrator: the tables last made, of meshes and of others.
+TABLES: Slot[dict[bool, _Table]] = Slot(dict)
+
 
 def bent_rows(chosen: list[tuple[mi.Shape, ShapeFacts]], memory: Memory) -> tuple[BentRows, tuple[BentMap, ...]]:
-    """Rows of `chosen` shapes with maps, all of them meshes or none, and their maps. `front` and `back` are as the BSDF
-    has them.
+    """Rows of `chosen` shapes with maps, all of them meshes or none, and their maps; kept from call to call.
+
+    `front` and `back` are as the BSDF has them.
     """
-    maps: list[BentMap] = []
+    of_shapes = [bent_maps(shape.bsdf()) for shape, _ in chosen]
+    patches = [_patches(shape, facts, maps, 1 / len(chosen), memory)
+               for (shape, facts), maps in zip(chosen, of_shapes, strict=True)]  # fmt: skip
+    maps, moves = [bent for own in of_shapes for bent in own], [facts.moves for _, facts in chosen]
+    meshes = chosen[0][1].is_mesh
+    known = memory[TABLES].get(meshes)
+    if known is None or not known.is_of(patches, maps, moves):
+        known = _Table((patches, maps, moves), _joined_rows(chosen, of_shapes, patches))
+        memory[TABLES][meshes] = known
+    return known.rows, tuple(maps)
+
+
+def _joined_rows(
+    chosen: list[tuple[mi.Shape, ShapeFacts]], of_shapes: list[list[BentMap]], patches: list[Patches]
+) -> BentRows:
     columns: dict[str, list[np.ndarray]] = {}
-    first = 0
-    for number, (shape, facts) in enumerate(chosen):
-        own_maps = bent_maps(shape.bsdf())
-        patches, corners = _patches(shape, facts, own_maps, memory), None
+    first, before = 0, 0
+    for number, ((shape, facts), maps, cut) in enumerate(zip(chosen, of_shapes, patches, strict=True)):
+        corners = None
         if facts.is_mesh:
-            corners = np.array(mesh_faces(shape)).T[patches.part] + first
+            corners = np.array(mesh_faces(shape)).T[cut.part] + first
             first += shape.vertex_count()
-        for bent in own_maps:
+        for place, bent in enumerate(maps, before):
             turned = facts.is_mesh and winding(shape) < 0
-            own = _columns(patches, corners) | {
-                "texels": _texels(bent.texture, patches.uv),
-                "shape": number, "map": len(maps), "mirrored": bent.mirrored, "moves": facts.moves,
+            own = _columns(cut, corners) | {
+                "texels": _texels(bent.texture, cut.uv),
+                "shape": number, "map": place, "mirrored": bent.mirrored, "moves": facts.moves,
                 "front": bent.back if turned else bent.front, "back": bent.front if turned else bent.back,
             }  # fmt: skip
             for name, values in own.items():
-                alike = np.broadcast_to(values, len(patches.part)) if np.ndim(values) == 0 else values
+                alike = np.broadcast_to(values, len(cut.part)) if np.ndim(values) == 0 else values
                 columns.setdefault(name, []).append(alike)
-            maps.append(bent)
-    return BentRows(**{name: _on_device(name, np.concatenate(parts)) for name, parts in columns.items()}), tuple(maps)
+        before += len(maps)
+    return BentRows(**{name: _on_device(name, np.concatenate(parts)) for name, parts in columns.items()})
 
 
 def _columns(patches: Patches, corners: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -107,26 +138,27 @@ def _on_device(name: str, values: np.ndarray):
     return uploaded(mi.Float if name == "texels" else mi.UInt32, values)
 
 
-def _patches(shape: mi.Shape, facts: ShapeFacts, maps: list[BentMap], memory: Memory) -> Patches:
+def _patches(shape: mi.Shape, facts: ShapeFacts, maps: list[BentMap], share: float, memory: Memory) -> Patches:
+    """`share`: of all patches."""
     textures = [bent.texture for bent in maps]
     buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
     known, sizes = memory[PATCHES].get(facts.name), [_scale(texture) for texture in textures]
     if known is None or not known.is_of(buffers, sizes):
-        known = _Known(buffers, sizes, _cut(shape, facts, textures))
+        known = _Known(buffers, sizes, _cut(shape, facts, textures, share))
         memory[PATCHES][facts.name] = known
     return known.patches
 
 
-def _cut(shape: mi.Shape, facts: ShapeFacts, textures: list[mi.Texture]) -> Patches:
+def _cut(shape: mi.Shape, facts: ShapeFacts, textures: list[mi.Texture], share: float) -> Patches:
     """A shape in patches, about as small as texels."""
     if not facts.is_mesh:
         whole = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
         cells = max(float(_texels(texture, whole)[0]) for texture in textures) ** 2
-        side = int(np.ceil(np.sqrt(np.clip(2 * cells, LEAST_PATCHES, MOST_PATCHES) / 2)))
+        side = int(np.ceil(np.sqrt(np.clip(2 * cells, share * LEAST_PATCHES, share * MOST_PATCHES) / 2)))
         return body_patches(facts.plugin, (side, side))
     uv = texcoords(shape)
     cells = sum(np.max([_texels(texture, uv) for texture in textures], 0) ** 2)
-    wanted = np.clip(cells, LEAST_PATCHES, MOST_PATCHES)
+    wanted = np.clip(cells, share * LEAST_PATCHES, share * MOST_PATCHES)
     return face_patches(uv, max(1, int(np.sqrt(wanted / max(len(uv), 1)))))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,14 +26,14 @@ def bent_kinds(job: Job, meshes: list[ShapeFacts], analytic: list[ShapeFacts], c
     kinds: list[EdgeKind] = []
     shapes = edge_shapes(job).shapes
     for family in (meshes, analytic):
-        chosen = [facts for facts in family if bent_maps(shapes[facts.index].bsdf())]
+        chosen = [facts for facts in family if facts.sees_frame and bent_maps(shapes[facts.index].bsdf())]
         if job.options.depth_limit < 2 or not chosen:
             continue
         own = tuple(shapes[facts.index] for facts in chosen)
         rows, maps = bent_rows(list(zip(own, chosen, strict=True)), job.call.memory)
         fronts = [winding(shape) if facts.is_mesh else 0.0 for shape, facts in zip(own, chosen, strict=True)]
         front, back = seen_sides(job, chosen, fronts, rows.shape, rows.part)
-        rows.front, rows.back = rows.front & (front > 0), rows.back & (back > 0)
+        rows = replace(rows, front=rows.front & (front > 0), back=rows.back & (back > 0))  # not in place: it is kept
         common = (maps, pointers(mi.ShapePtr, own), own)
         if family is meshes:
             surface = BentMeshes(*common, dr.detach(attached_positions(own)))
