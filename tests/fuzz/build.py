@@ -28,7 +28,7 @@ def _resolved(item: dict[str, Any]) -> Any:
         grey = np.array(made.pop("texels"), dtype=np.float32)
         if made["type"] == "envmap":
             return {**made, "bitmap": mi.Bitmap(np.repeat(grey[..., None], 3, axis=2))}
-        return {**made, **RAW, "bitmap": mi.Bitmap(grey[..., None])}
+        return {**made, **RAW, "bitmap": mi.Bitmap(grey if grey.ndim == 3 else grey[..., None])}
     return MADE[made["type"]](made) if made["type"] in MADE else made
 
 

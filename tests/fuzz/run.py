@@ -1,7 +1,7 @@
 """Many seeds in one process, a line each: `PYTHONPATH=tests:. python -m fuzz.run FIRST COUNT [KIND]`.
 
 KIND is `specular` (with mirrors, glass, plastic, windows and masks), `bidirectional` (these by `psdr_bdpt`), `curved`
-(with SDF grids, curves, ellipsoids and instances), or nothing.
+(with SDF grids, curves, ellipsoids and instances), `bent` (with bump and normal maps), or nothing.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 
 import mitsuba as mi
+from fuzz.bent import bent_case_of
 from fuzz.curved import curved_case_of
 from fuzz.scenes import case_of
 from fuzz.specular import bidirectional_case_of, specular_case_of
@@ -17,7 +18,7 @@ from fuzz.verdict import VARIANT, examine
 import psdr_jit  # noqa: F401  (registers the plugins)
 
 KINDS = {"": case_of, "specular": specular_case_of, "bidirectional": bidirectional_case_of,
-         "curved": curved_case_of}  # fmt: skip
+         "curved": curved_case_of, "bent": bent_case_of}  # fmt: skip
 
 
 def main(first: int, count: int, kind: str = "") -> None:

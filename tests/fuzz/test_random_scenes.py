@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fuzz import verdict
+from fuzz.bent import bent_case_of
 from fuzz.build import build
 from fuzz.curved import curved_case_of
 from fuzz.scenes import Case, case_of
@@ -34,8 +35,8 @@ WITH_OUTLINES = 28  # a seed whose derivative is in its outlines, too
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
-@pytest.mark.parametrize("draw", [case_of, specular_case_of, bidirectional_case_of, curved_case_of],
-                         ids=["smooth", "specular", "bidirectional", "curved"])
+@pytest.mark.parametrize("draw", [case_of, specular_case_of, bidirectional_case_of, curved_case_of, bent_case_of],
+                         ids=["smooth", "specular", "bidirectional", "curved", "bent"])
 def test_a_random_scene(mono, draw, seed):
     case = draw(seed)
     outcome = examine(case)
@@ -56,7 +57,8 @@ def _same(case: Case, outcome: Outcome) -> bool:
     return examine(case).word == outcome.word
 
 
-@pytest.mark.parametrize("draw", [case_of, specular_case_of, curved_case_of], ids=["smooth", "specular", "curved"])
+@pytest.mark.parametrize("draw", [case_of, specular_case_of, curved_case_of, bent_case_of],
+                         ids=["smooth", "specular", "curved", "bent"])
 def test_cases_are_always_the_same_and_load(mono, draw):
     """Also after a round trip through text, which is how a failure is reported; and no two are alike."""
     texts = [json.dumps(draw(seed)) for seed in range(LOADED)]
