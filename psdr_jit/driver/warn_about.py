@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..plan.call import Call
 from ..scene.behind_lights import warn_about_shapes_behind_lights
 from ..scene.bent_away import warn_about_bent_normals
+from ..scene.bent_terminator import warn_about_terminators
 from ..scene.clipping import warn_about_clipping
 from ..scene.facts import SceneFacts
 from ..scene.painted_lights import warn_about_painted_lights
@@ -21,5 +22,6 @@ def warn_about(call: Call, facts: SceneFacts) -> None:
         if facts.geometry_moves:
             warn_about_clipping(call.scene, call.sensor, facts, call.memory)
         warn_about_bent_normals(call.scene, call.sensor, facts, call.memory)
+        warn_about_terminators(call.scene, facts, call.memory)
     if call.mode == "backward":
         warn_about_stale_values(call.scene, facts, call.memory)

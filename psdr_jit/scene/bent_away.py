@@ -42,7 +42,7 @@ WITH_EDGES = ("mesh", "analytic")
 
 def warn_about_bent_normals(scene: mi.Scene, sensor: mi.Sensor, facts: SceneFacts, memory: Memory) -> None:
     """Name shapes of which the sensor sees many points whose bent normals turn from it, once each."""
-    bent = [(shape, why, maps) for shape in facts.shapes if shape.index >= 0
+    bent = [(shape, why, maps) for shape in facts.shapes if shape.index >= 0 and shape.sees_frame
             and (maps := bent_maps(scene.shapes()[shape.index].bsdf()))
             and (why := _without_edges(shape, maps, facts.view_moves or shape.moves))]  # fmt: skip
     if not bent:

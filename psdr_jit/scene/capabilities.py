@@ -157,7 +157,7 @@ SUPPORT = (
         "a bump map's slopes step at edges, and so does what is sent where bent normals turn from the viewer; these "
         "curves have no edge where a map is itself differentiated, or moves within another one, or on a curve, grid or "
         "ellipsoid: if half a per cent of what is seen of the shape is turned, or normals at a rim are bent by .01 "
-        "from the viewer, warning"),
+        "from the viewer, warning; without `use_shadowing_function`: warning"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),
