@@ -41,6 +41,7 @@ GROUPS = 32  # of seeds, from whose scatter errors are measured
 FINER = 3.0  # by how much each further look's step is smaller
 COARSER = 5.0  # by how much the last look's step is larger than the first's
 STEP_SHARE = 0.5  # of what was off, at most left by a third look that believes the step to be the cause
+MORE = 16  # times the samples, where the noise of a third look hides whether it is so
 KINK_SHARE = 0.5  # of the differences' asymmetry that a smaller step must leave; that of a smooth image goes with it
 
 
@@ -126,12 +127,16 @@ def _examine(case: Mapping[str, Any], first: Effort, *others: Effort) -> tuple[s
         look = compare(motion, case, first)
     if not look.wrong:
         return (NOISY if look.blind else RIGHT), str(look)
-    before, suspected = str(look), np.inf
+    before, earlier, suspected = str(look), np.inf, np.inf
     for number, effort in enumerate(others, 1):
         look = compare(motion, case, effort, FINER**number)
         if not look.wrong and look.off < STEP_SHARE * suspected:
             return RIGHT, f"{look}, after {before}"
-        before, suspected = f"{look}, after {before}", look.off
+        before, earlier, suspected = f"{look}, after {before}", suspected, look.off
+    if not look.wrong:  # its noise may be as large as what was to go away
+        look = compare(motion, case, replace(effort, reference_spp=MORE * effort.reference_spp), FINER**number)
+        if not look.wrong and look.off < STEP_SHARE * earlier:
+            return RIGHT, f"with more samples {look}, after {before}"
     coarse = compare(motion, case, LAST, 1 / COARSER)
     if not coarse.wrong:
         return NOISY, f"by a larger step {coarse}, after {before}"

@@ -81,7 +81,7 @@ def test_area_lights_need_no_such_help(llvm):
 
 
 @pytest.mark.parametrize(("light", "runs"), [
-    ({"type": "sphere", "radius": 0.1, "center": [0, 0, 3], "emitter": {"type": "area"}}, False),
+    also({"type": "sphere", "radius": 0.1, "center": [0, 0, 3], "emitter": {"type": "area"}}, False),
     also({"type": "point", "position": [0, 0, 3]}, True),
 ], ids=["area", "point"])  # fmt: skip
 def test_smooth_shaded_glass_is_left_to_camera_paths_where_they_see_it(llvm, light, runs):
