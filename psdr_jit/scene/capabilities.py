@@ -154,10 +154,11 @@ SUPPORT = (
         "blends always, Mitsuba does not report their sampling density; others " + _MOVING.removesuffix("; ")),
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
-        "a bump map's slopes step at edges, and so does what is sent where bent normals turn from the viewer; these "
-        "curves have no edge where a map is itself differentiated, or moves within another one, or on a curve, grid or "
-        "ellipsoid: if half a per cent of what is seen of the shape is turned, or normals at a rim are bent by .01 "
-        "from the viewer, warning; without `use_shadowing_function`: warning"),
+        "a bump map's slopes step at edges, and so does what is sent where bent normals turn from the viewer (noisy "
+        "with more than ten texels across a face); these curves have no edge where a map is itself differentiated, or "
+        "moves within another one, or on a curve, grid or ellipsoid: if half a per cent of what is seen of the shape "
+        "is turned, or normals at a rim are bent by .01 from the viewer, warning; without `use_shadowing_function`: "
+        "warning"),
     Row("participating media", "error", "ignored by Mitsuba's path as well"),
     Row("polarised variants", "error", ""),
     Row("films that convert samples themselves (specfilm)", "error", ""),
