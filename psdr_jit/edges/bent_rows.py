@@ -52,6 +52,7 @@ class _Known:
     buffers: list
     sizes: list[np.ndarray]  # of maps, as of `_scale`
     patches: Patches
+    front: float  # of a mesh, as of `ShapePatterns`; else 0
 
     def is_of(self, buffers: list, sizes: list[np.ndarray]) -> bool:
         same = len(sizes) == len(self.sizes) and all(map(np.array_equal, sizes, self.sizes))
@@ -60,15 +61,16 @@ class _Known:
 
 @dataclass(frozen=True)
 class _Table:
-    """Rows, and what they were made from: patches and maps, kept alive, by shape, and which shapes move."""
+    """Rows, and what they were made from: patches and maps, kept alive, and which shapes move."""
 
-    made_from: tuple[list, list[BentMap], list[bool]]
+    of_shapes: list[_Known]
+    maps: list[BentMap]
+    moves: list[bool]
     rows: BentRows
 
-    def is_of(self, patches: list[Patches], maps: list[BentMap], moves: list[bool]) -> bool:
-        same = [id(p) for p in patches] == [id(p) for p in self.made_from[0]]
-        same &= [id(m.node) for m in maps] == [id(m.node) for m in self.made_from[1]]
-        return same and moves == self.made_from[2]
+    def is_of(self, of_shapes: list[_Known], maps: list[BentMap], moves: list[bool]) -> bool:
+        same = [id(known) for known in of_shapes] == [id(known) for known in self.of_shapes]
+        return same and [id(m.node) for m in maps] == [id(m.node) for m in self.maps] and moves == self.moves
 
 
 #: Patches of all shapes together, about: at least; and at most, until when they are as small as texels. No fewer than
@@ -82,39 +84,41 @@ PATCHES: Slot[dict[str, _Known]] = Slot(dict)
 TABLES: Slot[dict[bool, _Table]] = Slot(dict)
 
 
-def bent_rows(chosen: list[tuple[mi.Shape, ShapeFacts]], memory: Memory) -> tuple[BentRows, tuple[BentMap, ...]]:
-    """Rows of `chosen` shapes with maps, all of them meshes or none, and their maps; kept from call to call.
+def bent_rows(
+    chosen: list[tuple[mi.Shape, ShapeFacts]], memory: Memory
+) -> tuple[BentRows, tuple[BentMap, ...], list[float]]:
+    """Rows of `chosen` shapes with maps, all of them meshes or none; their maps; and by shape `ShapePatterns.front`, or
+    0 if it is no mesh. Kept from call to call.
 
     `front` and `back` are as the BSDF has them.
     """
-    of_shapes = [bent_maps(shape.bsdf()) for shape, _ in chosen]
-    patches = [_patches(shape, facts, maps, 1 / len(chosen), memory)
-               for (shape, facts), maps in zip(chosen, of_shapes, strict=True)]  # fmt: skip
-    maps, moves = [bent for own in of_shapes for bent in own], [facts.moves for _, facts in chosen]
+    own_maps = [bent_maps(shape.bsdf()) for shape, _ in chosen]
+    of_shapes = [_patches(shape, facts, maps, 1 / len(chosen), memory)
+                 for (shape, facts), maps in zip(chosen, own_maps, strict=True)]  # fmt: skip
+    maps, moves = [bent for own in own_maps for bent in own], [facts.moves for _, facts in chosen]
     meshes = chosen[0][1].is_mesh
-    known = memory[TABLES].get(meshes)
-    if known is None or not known.is_of(patches, maps, moves):
-        known = _Table((patches, maps, moves), _joined_rows(chosen, of_shapes, patches))
-        memory[TABLES][meshes] = known
-    return known.rows, tuple(maps)
+    table = memory[TABLES].get(meshes)
+    if table is None or not table.is_of(of_shapes, maps, moves):
+        table = _Table(of_shapes, maps, moves, _joined_rows(chosen, own_maps, of_shapes))
+        memory[TABLES][meshes] = table
+    return table.rows, tuple(maps), [known.front for known in of_shapes]
 
 
 def _joined_rows(
-    chosen: list[tuple[mi.Shape, ShapeFacts]], of_shapes: list[list[BentMap]], patches: list[Patches]
+    chosen: list[tuple[mi.Shape, ShapeFacts]], own_maps: list[list[BentMap]], of_shapes: list[_Known]
 ) -> BentRows:
     columns: dict[str, list[np.ndarray]] = {}
     first, before = 0, 0
-    for number, ((shape, facts), maps, cut) in enumerate(zip(chosen, of_shapes, patches, strict=True)):
-        corners = None
+    for number, ((shape, facts), maps, known) in enumerate(zip(chosen, own_maps, of_shapes, strict=True)):
+        cut, corners = known.patches, None
         if facts.is_mesh:
             corners = np.array(mesh_faces(shape)).T[cut.part] + first
             first += shape.vertex_count()
         for place, bent in enumerate(maps, before):
-            turned = facts.is_mesh and winding(shape) < 0
+            front, back = (bent.back, bent.front) if known.front < 0 else (bent.front, bent.back)
             own = _columns(cut, corners) | {
-                "texels": _texels(bent.texture, cut.uv),
-                "shape": number, "map": place, "mirrored": bent.mirrored, "moves": facts.moves,
-                "front": bent.back if turned else bent.front, "back": bent.front if turned else bent.back,
+                "texels": _texels(bent.texture, cut.uv), "shape": number, "map": place,
+                "mirrored": bent.mirrored, "moves": facts.moves, "front": front, "back": back,
             }  # fmt: skip
             for name, values in own.items():
                 alike = np.broadcast_to(values, len(cut.part)) if np.ndim(values) == 0 else values
@@ -138,15 +142,16 @@ def _on_device(name: str, values: np.ndarray):
     return uploaded(mi.Float if name == "texels" else mi.UInt32, values)
 
 
-def _patches(shape: mi.Shape, facts: ShapeFacts, maps: list[BentMap], share: float, memory: Memory) -> Patches:
+def _patches(shape: mi.Shape, facts: ShapeFacts, maps: list[BentMap], share: float, memory: Memory) -> _Known:
     """`share`: of all patches."""
     textures = [bent.texture for bent in maps]
     buffers = [dr.detach(texcoords_buffer(shape)), faces_buffer(shape)] if facts.is_mesh else []
     known, sizes = memory[PATCHES].get(facts.name), [_scale(texture) for texture in textures]
     if known is None or not known.is_of(buffers, sizes):
-        known = _Known(buffers, sizes, _cut(shape, facts, textures, share))
+        front = winding(shape) if facts.is_mesh else 0.0
+        known = _Known(buffers, sizes, _cut(shape, facts, textures, share), front)
         memory[PATCHES][facts.name] = known
-    return known.patches
+    return known
 
 
 def _cut(shape: mi.Shape, facts: ShapeFacts, textures: list[mi.Texture], share: float) -> Patches:

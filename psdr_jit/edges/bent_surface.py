@@ -19,8 +19,9 @@ from ..core.sensor_frame import towards_viewer
 from ..scene.bent_normals import BentMap
 from ..scene.poses import Poses
 from .bent_rows import BentRows
-from .curves import transform_point, transform_vector
-from .kind_pattern import FAR_SIDE, Surface, SurfacePoint, surface_point
+from .curves import transform_point
+from .kind_pattern import FAR_SIDE
+from .surface_points import Surface, SurfacePoint, point_of_body, point_of_face, surface_point
 
 #: Step for differences, in units of b per texel.
 DIFFERENCE = 2e-2
@@ -202,15 +203,13 @@ class BentMeshes(BentSurface):
     positions: mi.Point3f  # of all vertices, detached
 
     def place(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        p0, p1, p2 = (dr.gather(mi.Point3f, self.positions, v, active) for v in (rows.v0, rows.v1, rows.v2))
-        e1, e2 = mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
-        return SurfacePoint(mi.Point3f(p0 + q.x * e1 + q.y * e2), e1, e2)
+        return point_of_face(self.positions, rows, q, active)
 
     def met(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         return mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), _hit(self.pointers, rows, rows.part, q, active)
 
     def normal(self, rows: BentRows, at: SurfacePoint) -> mi.Normal3f:
-        return mi.Normal3f(dr.normalize(dr.cross(at.dx_dq0, at.dx_dq1)))
+        return at.normal
 
     def flat_normal(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> mi.Normal3f:
         return self.normal(rows, self.place(rows, q, active))
@@ -227,9 +226,7 @@ class BentBodies(BentSurface):
         return Poses.of(self.shapes)
 
     def place(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        columns = self.poses.at(rows.shape)
-        x, du, dv = surface_point(rows.part, q)
-        return SurfacePoint(transform_point(columns, x), *(transform_vector(columns, d) for d in (du, dv)))
+        return point_of_body(self.poses, rows, q)
 
     def met(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         local = surface_point(rows.part, q)[0]
@@ -240,7 +237,7 @@ class BentBodies(BentSurface):
     def normal(self, rows: BentRows, at: SurfacePoint) -> mi.Normal3f:
         """Outwards: on a sphere, texture coordinates lead around the other way."""
         outward = dr.select(rows.part == int(Surface.SPHERE), -1.0, 1.0)
-        return mi.Normal3f(dr.normalize(dr.cross(at.dx_dq0, at.dx_dq1)) * outward)
+        return mi.Normal3f(at.normal * outward)
 
     def flat_normal(self, rows: BentRows, q: mi.Point2f, active: mi.Bool) -> mi.Normal3f:
         return mi.Normal3f(0)

@@ -27,10 +27,10 @@ from .bent_surface import Bent, BentSurface, PatchPoint
 from .bent_ways import way_across
 from .film_cover import LENS_CENTRE, PatchOnFilm
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Use, Views
-from .kind_pattern import SurfacePoint
 from .lights import LightBounds
 from .location import EdgeLocation
 from .points import clearance, facing
+from .surface_points import SurfacePoint
 
 #: Sine up to which a root is one: beyond, h steps across 0.
 CLOSE = 1e-4

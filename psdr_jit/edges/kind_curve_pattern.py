@@ -19,10 +19,11 @@ from ..scene.surfaces import Rods, Splines
 from .curve_pattern_rows import Part
 from .film_cover import LENS_CENTRE
 from .kind import OnEdge, Side, Sight
-from .kind_pattern import FAR_SIDE, PatternLines, SurfacePoint
+from .kind_pattern import FAR_SIDE, PatternLines
 from .kind_rod import ASIDE, SUNK, TURN
 from .pattern_rows import PatternRows
 from .points import clearance
+from .surface_points import SurfacePoint
 
 #: How much farther beside a line its sides are looked at than on other shapes: u is rounded as the points are of which
 #: it is the direction, and curves are thin.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 from typing import ClassVar
 
@@ -23,7 +22,7 @@ import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, look_at, towards_viewer, viewpoint
 from ..scene.poses import Poses
-from .curves import transform_point, transform_vector
+from .curves import transform_point
 from .film_cover import LENS_CENTRE, PatchOnFilm, beside_film
 from .joined_meshes import attached_positions
 from .kind import FixedKind, OnEdge, Side, Sight, Use
@@ -31,6 +30,7 @@ from .lights import LightBounds
 from .location import EdgeLocation
 from .pattern_rows import PatternRows, PatternSet
 from .points import clearance, facing
+from .surface_points import SurfacePoint, point_of_body, point_of_face, surface_point
 from .wedges import Wedges
 
 #: Sine of the angle at which all corners of a patch of a sphere turn away if all of the patch does.
@@ -49,18 +49,6 @@ class LinePiece:
     @property
     def q(self) -> mi.Point2f:
         return self.a + self.at * self.along
-
-
-@dataclass
-class SurfacePoint:
-    """A point of a surface, and how it moves with the surface's coordinates. Detached."""
-
-    x: mi.Point3f  # [m]
-    dx_dq0: mi.Vector3f
-    dx_dq1: mi.Vector3f
-
-    def towards(self, dq) -> mi.Vector3f:
-        return self.dx_dq0 * dq.x + self.dx_dq1 * dq.y
 
 
 def piece_of_line(lines: PatternSet, rows: PatternRows, number: mi.UInt32, at: mi.Float, active) -> LinePiece:
@@ -195,12 +183,10 @@ class MeshPatterns(PatternLines):
     positions: mi.Point3f  # of all vertices, detached
 
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        p0, e1, e2 = _face(self.positions, rows, active)
-        return SurfacePoint(mi.Point3f(p0 + q.x * e1 + q.y * e2), e1, e2)
+        return point_of_face(self.positions, rows, q, active)
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
-        p0, e1, e2 = _face(attached_positions(self.shapes), rows, active)
-        return mi.Point3f(p0 + q.x * e1 + q.y * e2)
+        return point_of_face(attached_positions(self.shapes), rows, q, active).x
 
     def _unseen(self, frame: SensorFrame, corners: list[mi.Point3f], border: int) -> mi.Bool:
         view = towards_viewer(viewpoint(frame, mi.Point2f(LENS_CENTRE)), corners[0])
@@ -223,24 +209,9 @@ class MeshPatterns(PatternLines):
         return _normal(self.positions, dr.gather(PatternRows, self.lines.rows, row, active), active)
 
 
-def _face(positions: mi.Point3f, rows: PatternRows, active) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
-    """A corner of the rows' faces, and the sides from there."""
-    p0, p1, p2 = (dr.gather(mi.Point3f, positions, v, active) for v in (rows.v0, rows.v1, rows.v2))
-    return p0, mi.Vector3f(p1 - p0), mi.Vector3f(p2 - p0)
-
-
 def _normal(positions: mi.Point3f, rows: PatternRows, active) -> mi.Normal3f:
     """Unit normal of the rows' faces."""
-    _, e1, e2 = _face(positions, rows, active)
-    return mi.Normal3f(dr.normalize(dr.cross(e1, e2)))
-
-
-class Surface(IntEnum):
-    """Shapes without triangles, by their parametrisation in Mitsuba, in the space of their plugins."""
-
-    DISK = 0  # (u cos 2πv, u sin 2πv, 0)
-    CYLINDER = 1  # (cos 2πu, sin 2πu, v)
-    SPHERE = 2  # (sin πv cos 2πu, sin πv sin 2πu, cos πv)
+    return point_of_face(positions, rows, rows.q0, active).normal
 
 
 @dataclass(frozen=True)
@@ -257,9 +228,7 @@ class AnalyticPatterns(PatternLines):
         return Poses.of(self.shapes)
 
     def _point(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> SurfacePoint:
-        columns = self.poses.at(rows.shape)
-        x, du, dv = surface_point(rows.part, q)
-        return SurfacePoint(transform_point(columns, x), *(transform_vector(columns, d) for d in (du, dv)))
+        return point_of_body(self.poses, rows, q)
 
     def _attached(self, rows: PatternRows, q: mi.Point2f, active: mi.Bool) -> mi.Point3f:
         return transform_point(self.poses.attached_at(rows.shape), surface_point(rows.part, q)[0])
@@ -280,17 +249,3 @@ class AnalyticPatterns(PatternLines):
         rows, q = self._beside(row, sight, which, active)
         ray = mi.Ray3f(self._point(rows, q, active).x - sight.lead * sight.ω, sight.ω)
         return Side.found_by(ray, own=True)
-
-
-def surface_point(kind: mi.UInt32, uv: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector3f]:
-    """Point of a `Surface` in its own space, and its derivatives by u and v."""
-    disk, sphere = kind == int(Surface.DISK), kind == int(Surface.SPHERE)
-    sin_φ, cos_φ = dr.sincos(dr.two_pi * dr.select(disk, uv.y, uv.x))
-    sin_θ, cos_θ = dr.sincos(dr.pi * uv.y)
-    radial, around = mi.Vector3f(cos_φ, sin_φ, 0), dr.two_pi * mi.Vector3f(-sin_φ, cos_φ, 0)
-    x = dr.select(disk, uv.x * radial, dr.select(sphere, sin_θ * radial, radial))
-    x.z = dr.select(disk, 0, dr.select(sphere, cos_θ, uv.y))
-    du = dr.select(disk, radial, dr.select(sphere, sin_θ * around, around))
-    down = dr.pi * mi.Vector3f(cos_θ * cos_φ, cos_θ * sin_φ, -sin_θ)
-    dv = dr.select(disk, uv.x * around, dr.select(sphere, down, mi.Vector3f(0, 0, 1)))
-    return mi.Point3f(x), du, dv

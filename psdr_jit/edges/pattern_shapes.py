@@ -11,8 +11,8 @@ import numpy as np
 from ..core.compat import mesh_faces, mesh_positions, texcoords_buffer
 from ..core.upload import uploaded
 from ..scene.patterns import StepFamily
-from .kind_pattern import Surface
 from .pattern_rows import End, Lines, Patches, parallel_lines, rows_on, sides_on_lines
+from .surface_points import Surface
 
 #: Patches of a mesh at least: large faces are divided, so that parts that are near or hidden get their own weight.
 LEAST_PATCHES = 512

@@ -17,7 +17,6 @@ from .edge_shapes import edge_shapes
 from .joined_meshes import attached_positions
 from .kind import EdgeKind
 from .kind_bent import BentOutlines
-from .pattern_shapes import winding
 from .seen_sides import seen_sides
 
 
@@ -30,8 +29,7 @@ def bent_kinds(job: Job, meshes: list[ShapeFacts], analytic: list[ShapeFacts], c
         if job.options.depth_limit < 2 or not chosen:
             continue
         own = tuple(shapes[facts.index] for facts in chosen)
-        rows, maps = bent_rows(list(zip(own, chosen, strict=True)), job.call.memory)
-        fronts = [winding(shape) if facts.is_mesh else 0.0 for shape, facts in zip(own, chosen, strict=True)]
+        rows, maps, fronts = bent_rows(list(zip(own, chosen, strict=True)), job.call.memory)
         front, back = seen_sides(job, chosen, fronts, rows.shape, rows.part)
         rows = replace(rows, front=rows.front & (front > 0), back=rows.back & (back > 0))  # not in place: it is kept
         common = (maps, pointers(mi.ShapePtr, own), own)

@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from psdr_jit.edges.kind_pattern import Surface, surface_point
 from psdr_jit.edges.pattern_rows import BLOCK, End, Patches, parallel_lines, rows_on, sides_on_lines
+from psdr_jit.edges.surface_points import Surface, surface_point
 from psdr_jit.scene.patterns import StepFamily, pattern_textures, step_families
 
 SQUARE = np.array([[-1.3, -0.8], [2.1, -0.8], [-1.3, 1.9], [2.1, 1.9]])
