@@ -15,51 +15,27 @@ h. With ∂_i = ∂/∂b_i, a sample stands for |∂_1 x × ∂_2 x| / D, a leng
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, reduce
 from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
+from ..core.sensor_frame import SensorFrame, towards_viewer
+from .bent_looks import ASIDE, UNLIKELY
 from .bent_rows import BentRows
-from .bent_surface import Bent, BentSurface, PatchPoint
+from .bent_seen import SeenPatches
+from .bent_surface import BentSurface, PatchPoint
 from .bent_ways import way_across
-from .film_cover import LENS_CENTRE, PatchOnFilm
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Use, Views
 from .lights import LightBounds
 from .location import EdgeLocation
 from .points import clearance, facing
-from .surface_points import SurfacePoint
 
 #: Sine up to which a root is one: beyond, h steps across 0.
 CLOSE = 1e-4
 
 #: Step to the side at which the radiance of the surface is taken, in units of b per texel.
 STEP_ASIDE = 2e-3
-
-#: Where on a patch its weights look: at its corners, which it has in common with others, but for rounding, and between
-#: them. `ASIDE`: from corner to corner, in b.
-INSET = 1e-3
-ASIDE = 1 - 3 * INSET
-LOOKED_AT = tuple((INSET + ASIDE * b1, INSET + ASIDE * b2)
-                  for b1, b2 in ((0, 0), (1, 0), (0, 1), (0.5, 0.5), (0, 0.5), (0.5, 0)))  # fmt: skip
-
-#: The four triangles between these places.
-QUARTERS = ((0, 4, 5), (1, 3, 5), (2, 3, 4), (3, 4, 5))
-
-#: How much farther normals may be bent elsewhere, as a factor.
-BENT_FARTHER = 1.5
-
-#: Share of the weight of a patch that no curve was seen to cross: where h comes as close to 0 as it changes between the
-#: places, and elsewhere.
-POSSIBLE, UNLIKELY = 0.15, 0.01
-
-#: Samples of a patch on the film for each that finds a curve on it, about: weighed thrice, the variance was least.
-TRIES = 3.0
-
-#: Radiance steps by about this, relative to itself, per sine by which a normal is bent: it is turned over.
-STEP_PER_SINE = 2.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +48,7 @@ class BentOutlines(EdgeKind):
 
     rows: BentRows
     surface: BentSurface
+    seen: SeenPatches  # by the sensor
     centre: mi.Point3f  # of the scene
 
     @property
@@ -82,67 +59,13 @@ class BentOutlines(EdgeKind):
         return self.rows.moves
 
     def places(self) -> mi.Point3f:
-        return self._corners[0].x
+        return self.seen.corners[0].x
 
     def casts_shadow(self, lights: list[LightBounds], box: mi.ScalarBoundingBox3f) -> mi.Bool:
         return dr.full(mi.Bool, False, self.count)
 
-    @cached_property
-    def _corners(self) -> list[SurfacePoint]:
-        q = (self.rows.q0, self.rows.q1, self.rows.q2)
-        return [self.surface.place(self.rows, corner, mi.Bool(True)) for corner in q]
-
-    @cached_property
-    def _looks(self) -> list[Bent]:
-        """What patches are like where they are `LOOKED_AT`, one entry per row."""
-        index = dr.arange(mi.UInt32, self.count * len(LOOKED_AT))
-        number, b = index // self.count, mi.Point2f(0)
-        for k, place in enumerate(LOOKED_AT):
-            b = dr.select(number == k, mi.Point2f(*place), b)
-        rows = dr.gather(BentRows, self.rows, index - number * self.count)
-        every = self.surface.bent(rows, mi.Point2f(b), dr.full(mi.Bool, True, dr.width(index)))
-        dr.eval(every)
-        first = dr.arange(mi.UInt32, self.count)
-        return [dr.gather(Bent, every, first + k * self.count) for k in range(len(LOOKED_AT))]
-
-    @cached_property
-    def _sines(self) -> list[mi.Float]:
-        """There, of the angle by which normals are bent."""
-        return [dr.norm(dr.cross(look.n, look.n_s)) for look in self._looks]
-
-    @property
-    def _step(self) -> mi.Float:
-        """By about how much of itself the radiance steps."""
-        return sum(self._sines) * (STEP_PER_SINE / len(LOOKED_AT))
-
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
-        """The size of the patch on the film, in proportion to the step and to how much of it is crossed by curves."""
-        eye = viewpoint(frame, mi.Point2f(LENS_CENTRE))
-        slack = frame.aperture if frame.kind == "thinlens" else mi.Float(0)  # how far viewpoints are from the centre
-        cos, h, reach = [], [], []
-        for look in self._looks:
-            view = towards_viewer(eye, look.x)
-            far = dr.norm(view)
-            cos.append(dr.dot(look.n_s, view) / far)
-            h.append(dr.dot(look.seen_from(cos[-1], self.rows.mirrored), view) / far)
-            reach.append(slack / far)
-        lowest, highest, blur = _least(cos), _most(cos), _most(reach)
-        beyond = highest - lowest + blur + BENT_FARTHER * dr.max(_most(self._sines))
-        may = (lowest <= beyond) & (highest >= -beyond) & self._turned_to(eye, slack)
-        patch = PatchOnFilm.of([corner.x for corner in self._corners], frame)
-        size = dr.norm(patch.upper - patch.lower)
-        length = TRIES * size * self._step * _crossed(h, blur)
-        return dr.select(may, patch.cover(frame, border, length, size / 4 + patch.reach), 0)
-
-    def _turned_to(self, eye: mi.Vector4f, slack: mi.Float) -> mi.Bool:
-        """By row: may the viewer be on a side of the surface from which it may be looked at?"""
-        front, back = mi.Bool(False), mi.Bool(False)
-        for corner in self._corners:
-            view = towards_viewer(eye, corner.x)
-            cos = facing(self.surface.normal(self.rows, corner), view)
-            reach = self.surface.bulge * dr.norm(view) + slack
-            front, back = front | (cos > -reach), back | (cos < reach)
-        return (front & self.rows.front) | (back & self.rows.back)
+        return self.seen.film_weights(border)
 
     def line_weights(self, use: Use) -> mi.Float:
         """Area × mean |∇h| × the angle of the great circle, halved as an edge's azimuths are (4π sr count as 2π), in
@@ -150,7 +73,7 @@ class BentOutlines(EdgeKind):
         """
         if use is Use.SHADOW:
             return dr.zeros(mi.Float, self.count)
-        start, *others = self._looks[:3]
+        start, *others = self.seen.looks.at[:3]
         dx = [mi.Vector3f(look.x - start.x) / ASIDE for look in others]
         dn = [mi.Vector3f(look.n - start.n) / ASIDE for look in others]
         bend2 = dr.squared_norm(dn[0]) * dr.squared_norm(dx[1]) + dr.squared_norm(dn[1]) * dr.squared_norm(dx[0])
@@ -158,12 +81,12 @@ class BentOutlines(EdgeKind):
         # over |∂_1 x × ∂_2 x|, which is twice the area
         weight = dr.safe_sqrt(bend2 / 2) / 2 + UNLIKELY * dr.norm(dr.cross(*dx))
         sides = dr.select(self.rows.front, 0.5, 0) + dr.select(self.rows.back, 0.5, 0)
-        weight *= sides * dr.pi * self._step
+        weight *= sides * dr.pi * self.seen.looks.step
         return dr.select(dr.isfinite(weight), weight, 0)
 
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         rows = dr.gather(BentRows, self.rows, row, active)
-        way = way_across(self.surface, rows, t, view, active)
+        way = way_across(self.surface, rows, self.seen.cell(row, t, active), view, active)
         r = self.surface.turns_away(rows, way.start, way.along, way.h, view, way.exists)
         b = mi.Point2f(way.start + r * way.along)
         bent = self.surface.bent(rows, b, way.exists)
@@ -251,21 +174,3 @@ class BentOutlines(EdgeKind):
         _, _, here = self._located(row, at, active)
         m = here.gradient(ω)
         return mi.Vector3f(-here.n * dr.select(active, dr.dot(m, n_perp) / dr.squared_norm(m), 0))
-
-
-def _crossed(h: list[mi.Float], blur: mi.Float) -> mi.Float:
-    """About how much of a patch is crossed by curves, from h where it is `LOOKED_AT`; known up to `blur`."""
-    near = dr.select(_least([dr.abs(value) for value in h]) < _most(h) - _least(h), mi.Float(POSSIBLE), UNLIKELY)
-    share = mi.Float(0)
-    for quarter in QUARTERS:
-        own = [h[k] for k in quarter]
-        share += dr.select((_least(own) <= blur) & (_most(own) >= -blur), 1 / len(QUARTERS), 0)
-    return dr.maximum(share, near)
-
-
-def _least(values: list[mi.Float]) -> mi.Float:
-    return reduce(dr.minimum, values)
-
-
-def _most(values: list[mi.Float]) -> mi.Float:
-    return reduce(dr.maximum, values)

@@ -12,6 +12,7 @@ from ..plan.job import Job
 from ..scene.bent_normals import bent_maps
 from ..scene.facts import ShapeFacts
 from .bent_rows import bent_rows
+from .bent_seen import SeenPatches
 from .bent_surface import BentBodies, BentMeshes
 from .edge_shapes import edge_shapes
 from .joined_meshes import attached_positions
@@ -39,5 +40,5 @@ def bent_kinds(job: Job, meshes: list[ShapeFacts], analytic: list[ShapeFacts], c
         else:
             surface = BentBodies(*common)
         dr.eval(rows)
-        kinds.append(BentOutlines(rows, surface, centre))
+        kinds.append(BentOutlines(rows, surface, SeenPatches(rows, surface, job.frame), centre))
     return kinds

@@ -155,7 +155,7 @@ SUPPORT = (
     Row("checkerboard, nearest-neighbour bitmap, mesh attributes", "yes", "where texture coordinates move: warning"),
     Row("bump map, normal map", "yes",
         "a bump map's slopes step at edges, and so does what is sent where bent normals turn from the viewer (noisy "
-        "with more than ten texels across a face); these curves have no edge where a map is itself differentiated, or "
+        "where texels are small against pixels); these curves have no edge where a map is itself differentiated, or "
         "moves within another one, or on a curve, grid or ellipsoid: if half a per cent of what is seen of the shape "
         "is turned, or normals at a rim are bent by .01 from the viewer, warning; without `use_shadowing_function`: "
         "warning"),

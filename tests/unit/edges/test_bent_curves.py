@@ -11,6 +11,7 @@ from variants import also
 from psdr_jit.core.sensor_frame import viewpoint
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.driver.prepare import prepare
+from psdr_jit.edges import bent_cells, bent_rows
 from psdr_jit.edges.bent_rows import BentRows
 from psdr_jit.edges.kind_bent import BentOutlines
 from psdr_jit.edges.scene_table import scene_edges
@@ -40,29 +41,25 @@ def outlines(plugin: str, texels: int) -> tuple[BentOutlines, mi.Vector4f]:
     return kind, viewpoint(job.frame, mi.Point2f(0.5))
 
 
-def inside_band(kind: BentOutlines, view: mi.Vector4f) -> float:
+def inside_band(kind: BentOutlines, view: mi.Vector4f, grid: int) -> float:
     """∫ δ(h) dA over all patches, as the area of |h| < BAND divided by 2 BAND; of what faces the viewer."""
-    i = dr.arange(mi.UInt32, kind.count * GRID**2)
-    row, k = i // GRID**2, i % GRID**2
-    b = mi.warp.square_to_uniform_triangle((mi.Point2f(k % GRID, k // GRID) + 0.5) / GRID)
+    i = dr.arange(mi.UInt32, kind.count * grid**2)
+    row, k = i // grid**2, i % grid**2
+    b = mi.warp.square_to_uniform_triangle((mi.Point2f(k % grid, k // grid) + 0.5) / grid)
     rows, everywhere = dr.gather(BentRows, kind.rows, row), mi.Bool(True)
     h = kind.surface.height(rows, kind.surface.bent(rows, b, everywhere), view)
     place = kind.surface.place(rows, rows.q(b), everywhere)
-    area = dr.norm(dr.cross(place.towards(rows.q1 - rows.q0), place.towards(rows.q2 - rows.q0))) / (2 * GRID**2)
+    area = dr.norm(dr.cross(place.towards(rows.q1 - rows.q0), place.towards(rows.q2 - rows.q0))) / (2 * grid**2)
     towards = mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(place.x)
     faces = dr.dot(kind.surface.normal(rows, place), towards) > 0
     inside = (dr.abs(h) < BAND) & (faces & rows.front | ~faces & rows.back)
     return float(dr.sum(dr.select(inside, area, 0))[0]) / (2 * BAND)
 
 
-@pytest.mark.parametrize(("plugin", "texels"), [
-    ("rectangle", 3), also("rectangle", 150), ("sphere", 5), also("sphere", 100), also("cylinder", 4), also("disk", 5),
-])  # fmt: skip
-def test_points_and_what_they_weigh(plugin, texels):
-    """Points lie on the curve, and the sum of their weights is ∫ δ(h) dA; patches are small against texels, or not."""
-    kind, view = outlines(plugin, texels)
-    i = dr.arange(mi.UInt32, kind.count * PER_ROW)
-    row, t = i // PER_ROW, (mi.Float(i % PER_ROW) + mi.PCG32(dr.width(i)).next_float32()) / PER_ROW
+def assert_weights(kind: BentOutlines, view: mi.Vector4f, per_row: int = PER_ROW, grid: int = GRID) -> None:
+    """Points lie on the curve, and the sum of their weights is ∫ δ(h) dA."""
+    i = dr.arange(mi.UInt32, kind.count * per_row)
+    row, t = i // per_row, (mi.Float(i % per_row) + mi.PCG32(dr.width(i)).next_float32()) / per_row
     on = kind.on(row, t, view, mi.Bool(True))
     rows, b = dr.gather(BentRows, kind.rows, row), mi.Point2f(on.local.x, on.local.y)
     h = kind.surface.height(rows, kind.surface.bent(rows, b, on.valid), view)
@@ -70,5 +67,27 @@ def test_points_and_what_they_weigh(plugin, texels):
     towards = mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(on.x)
     m = kind.surface.at(rows, b, on.local.z, on.valid).gradient(-dr.normalize(towards))
     weight = dr.select(on.valid, dr.norm(on.dx) / dr.norm(m), 0)
-    found, expected = float(dr.sum(weight)[0]) / PER_ROW, inside_band(kind, view)
+    found, expected = float(dr.sum(weight)[0]) / per_row, inside_band(kind, view, grid)
     assert expected > 0.05 and found == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize(("plugin", "texels"), [
+    ("rectangle", 3), also("rectangle", 150), ("sphere", 5), also("sphere", 100), also("cylinder", 4), also("disk", 5),
+])  # fmt: skip
+def test_points_and_what_they_weigh(plugin, texels):
+    """Patches are small against texels, or about as large."""
+    assert_weights(*outlines(plugin, texels))
+
+
+@pytest.mark.parametrize(("plugin", "texels", "most"), [
+    ("sphere", 30, bent_cells.MOST_CELLS), also("rectangle", 100, 1000), also("cylinder", 60, bent_cells.MOST_CELLS),
+])  # fmt: skip
+def test_patches_of_many_texels(plugin, texels, most, monkeypatch):
+    """They are cut into cells, which may have many texels themselves, and are picked as they are crossed."""
+    monkeypatch.setattr(bent_rows, "LEAST_PATCHES", 32)
+    monkeypatch.setattr(bent_rows, "MOST_PATCHES", 64)
+    monkeypatch.setattr(bent_cells, "LEAST_CELLS", 0)
+    monkeypatch.setattr(bent_cells, "MOST_CELLS", most)
+    kind, view = outlines(plugin, texels)
+    assert kind.seen.cell(mi.UInt32(0), mi.Float(0.5), mi.Bool(True)).per_side[0] > 1
+    assert_weights(kind, view, 4096, 128)
