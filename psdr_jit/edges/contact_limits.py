@@ -83,7 +83,8 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
     if job.options.depth_limit < 2:
         return
     memory = job.call.memory
-    if job.form == "material" and job.options.depth_limit > 2:
+    asked_for = job.options.form != "auto" and job.form == "material"  # a pilot looks at it as well
+    if asked_for and job.options.depth_limit > 2:
         _warn_about_material_form(contacts, memory)
     for glass, other in contacts.glass:
         warn_once(

@@ -160,10 +160,14 @@ def test_material_form_at_contacts_is_named(llvm, name, form, depth, said):
     ("name", "form", "said"),
     [("on a floor", "material", True), ("sunk into a floor", "material", True), ("sunk into a floor", "spatial", False),
      ("above a floor", "material", False), ("wall", "material", True), ("tiles", "material", False),
-     ("cup on a floor", "material", True), ("cup in a floor", "material", True), ("ball in a floor", "material", True)],
+     ("cup on a floor", "material", True), ("cup in a floor", "material", True), ("ball in a floor", "material", True),
+     ("on a floor", "auto", False)],
 )  # fmt: skip
 def test_material_form_before_a_moving_camera_is_named(llvm, name, form, said):
-    """What touches, and what is seen slides over: of the interior term the deviation is 30 times that of the other."""
+    """What touches, and what is seen slides over: of the interior term the deviation is 30 times that of the other.
+
+    Not where a pilot looks at the material form to choose another one.
+    """
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         scene = scene_of(shapes_of(name))
