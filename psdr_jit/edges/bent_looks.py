@@ -1,4 +1,4 @@
-"""What surfaces with bump or normal maps are like at a few places of a triangle, and what of it curves cross there."""
+"""What surfaces with bump or normal maps are like at a few places of a patch, and what of it curves cross there."""
 
 from __future__ import annotations
 
@@ -12,56 +12,51 @@ from ..core.sensor_frame import towards_viewer
 from .bent_rows import BentRows
 from .bent_surface import Bent, BentSurface
 
-#: Where on a triangle its weights look: at its corners, which it has in common with others, but for rounding, and
-#: between them. `ASIDE`: from corner to corner, in b.
+#: How far inside of what is looked at its corners are looked at, which it has in common with others, in its own size.
 INSET = 1e-3
-ASIDE = 1 - 3 * INSET
-LOOKED_AT = tuple((INSET + ASIDE * b1, INSET + ASIDE * b2)
-                  for b1, b2 in ((0, 0), (1, 0), (0, 1), (0.5, 0.5), (0, 0.5), (0.5, 0)))  # fmt: skip
+ASIDE = 1 - 3 * INSET  # from corner to corner of a triangle
 
-#: The four triangles between these places.
-QUARTERS = ((0, 4, 5), (1, 3, 5), (2, 3, 4), (3, 4, 5))
 
-#: Share of the weight of a triangle that no curve was seen to cross: where h comes as close to 0 as it changes between
-#: the places, and elsewhere.
+@dataclass(frozen=True)
+class Places:
+    """Where something is looked at, in its own coordinates, and the triangles between these places."""
+
+    places: tuple[tuple[float, float], ...]
+    triangles: tuple[tuple[int, int, int], ...]
+
+
+ON_TRIANGLE = Places(
+    tuple((INSET + ASIDE * b1, INSET + ASIDE * b2)
+          for b1, b2 in ((0, 0), (1, 0), (0, 1), (0.5, 0.5), (0, 0.5), (0.5, 0))),
+    ((0, 4, 5), (1, 3, 5), (2, 3, 4), (3, 4, 5)),
+)  # fmt: skip
+
+IN_RECTANGLE = Places(
+    tuple((INSET + (1 - 2 * INSET) * x, INSET + (1 - 2 * INSET) * y)
+          for x, y in ((0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0.5))),
+    ((0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+)  # fmt: skip
+
+#: Share of the weight of what no curve was seen to cross: where h comes as close to 0 as it changes between the places,
+#: and elsewhere.
 POSSIBLE, UNLIKELY = 0.15, 0.01
 
 #: Radiance steps by about this, relative to itself, per sine by which a normal is bent: it is turned over.
 STEP_PER_SINE = 2.0
 
 
-@dataclass
-class Corners:
-    """Triangles on patches, one per lane, in b."""
-
-    b0: mi.Point2f
-    b1: mi.Point2f
-    b2: mi.Point2f
-
-    def at(self, b: mi.Point2f) -> mi.Point2f:
-        return mi.Point2f(self.b0 + b.x * (self.b1 - self.b0) + b.y * (self.b2 - self.b0))
-
-    def within(self, part: Corners) -> Corners:
-        """A part of the triangles, given in their own coordinates."""
-        return Corners(self.at(part.b0), self.at(part.b1), self.at(part.b2))
-
-
-def whole_patch() -> Corners:
-    return Corners(mi.Point2f(0, 0), mi.Point2f(1, 0), mi.Point2f(0, 1))
-
-
 @dataclass(frozen=True)
 class Looks:
-    """Of triangles, one entry each, where they are `LOOKED_AT`; detached."""
+    """Of patches or parts of them, one entry each; detached."""
 
     at: list[Bent]
     mirrored: mi.Bool
+    triangles: tuple[tuple[int, int, int], ...]  # between the places
 
     @staticmethod
-    def of(surface: BentSurface, rows: BentRows, corners: Corners) -> Looks:
-        """`rows`: one for each triangle."""
-        places = [corners.at(mi.Point2f(*place)) for place in LOOKED_AT]
-        return Looks(surface.bent_at(rows, places, mi.Bool(True)), rows.mirrored)
+    def of(surface: BentSurface, rows: BentRows, b: list[mi.Point2f], where: Places) -> Looks:
+        """`rows`, `b`: one for each part; b of the places of `where`."""
+        return Looks(surface.bent_at(rows, b, mi.Bool(True)), rows.mirrored, where.triangles)
 
     @cached_property
     def sines(self) -> list[mi.Float]:
@@ -71,7 +66,7 @@ class Looks:
     @property
     def step(self) -> mi.Float:
         """By about how much of itself the radiance steps."""
-        return sum(self.sines) * (STEP_PER_SINE / len(LOOKED_AT))
+        return sum(self.sines) * (STEP_PER_SINE / len(self.at))
 
     def seen(self, eye: mi.Vector4f, slack: mi.Float) -> Seen:
         """From a viewpoint that is known up to `slack` [m]."""
@@ -82,24 +77,25 @@ class Looks:
             cos.append(dr.dot(look.n_s, view) / far)
             h.append(dr.dot(look.seen_from(cos[-1], self.mirrored), view) / far)
             reach.append(slack / far)
-        return Seen(cos, h, most(reach))
+        return Seen(cos, h, most(reach), self.triangles)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Triangles as they are seen where they are `LOOKED_AT`."""
+    """Parts of patches as they are seen at these places."""
 
     cos: list[mi.Float]  # between n_s and the direction to the viewer
     h: list[mi.Float]  # between the bent normal and this direction
     blur: mi.Float  # of both, as the viewpoint is not known
+    triangles: tuple[tuple[int, int, int], ...]
 
     def crossed(self) -> mi.Float:
-        """About how much of a triangle is crossed by curves."""
+        """About how much of a part is crossed by curves."""
         near = least([dr.abs(value) for value in self.h]) < most(self.h) - least(self.h)
         share = mi.Float(0)
-        for quarter in QUARTERS:
-            own = [self.h[k] for k in quarter]
-            share += dr.select((least(own) <= self.blur) & (most(own) >= -self.blur), 1 / len(QUARTERS), 0)
+        for corners in self.triangles:
+            own = [self.h[k] for k in corners]
+            share += dr.select((least(own) <= self.blur) & (most(own) >= -self.blur), 1 / len(self.triangles), 0)
         return dr.maximum(share, dr.select(near, mi.Float(POSSIBLE), UNLIKELY))
 
 

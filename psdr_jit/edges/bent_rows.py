@@ -16,6 +16,7 @@ from ..core.memory import Memory, Slot
 from ..core.upload import uploaded
 from ..scene.bent_normals import BentMap, bent_maps
 from ..scene.facts import ShapeFacts
+from ..scene.graph import is_piecewise_constant
 from ..scene.names import plugin_name
 from .pattern_rows import Patches
 from .pattern_shapes import body_patches, face_patches, texcoords, winding
@@ -34,7 +35,11 @@ class BentRows:
     q0: mi.Point2f  # corners of the patch in the surface's own coordinates
     q1: mi.Point2f
     q2: mi.Point2f
+    w0: mi.Point2f  # the same in texel coordinates (`bent_texels`), 0 of a map without texels
+    w1: mi.Point2f
+    w2: mi.Point2f
     texels: mi.Float  # of the map, from one end of the patch to the other
+    steps: mi.Bool  # do bent normals step from texel to texel?
     front: mi.Bool  # may it be looked at from the side of its normals (`BentSurface.normal`)?
     back: mi.Bool  # and from the other one?
     mirrored: mi.Bool  # as of `BentMap`
@@ -117,9 +122,9 @@ def _joined_rows(
         for place, bent in enumerate(maps, before):
             front, back = (bent.back, bent.front) if known.front < 0 else (bent.front, bent.back)
             own = _columns(cut, corners) | {
-                "texels": _texels(bent.texture, cut.uv), "shape": number, "map": place,
-                "mirrored": bent.mirrored, "moves": facts.moves, "front": front, "back": back,
-            }  # fmt: skip
+                "texels": _texels(bent.texture, cut.uv), "shape": number, "map": place, "mirrored": bent.mirrored,
+                "steps": bent.steps, "moves": facts.moves, "front": front, "back": back,
+            } | _texel_coordinates(bent.texture, cut.uv)  # fmt: skip
             for name, values in own.items():
                 alike = np.broadcast_to(values, len(cut.part)) if np.ndim(values) == 0 else values
                 columns.setdefault(name, []).append(alike)
@@ -168,14 +173,21 @@ def _cut(shape: mi.Shape, facts: ShapeFacts, textures: list[mi.Texture], share: 
 
 
 def _scale(texture: mi.Texture) -> np.ndarray:
-    """Texels per unit of texture coordinates, (2, 2); 0 where there are none."""
+    """Texels as an affine function of texture coordinates, (2, 3); 0 where there are none."""
     if plugin_name(texture) != "bitmap":
-        return np.zeros((2, 2))
+        return np.zeros((2, 3))
     params = mi.traverse(texture)
     height, width = dr.shape(params["data"])[:2]
-    return np.array(params["to_uv"].matrix, float)[:2, :2] * np.array([[width], [height]])
+    return np.array(params["to_uv"].matrix, float)[:2, :3] * np.array([[width], [height]])
+
+
+def _texel_coordinates(texture: mi.Texture, uv: np.ndarray) -> dict[str, np.ndarray]:
+    """Of the corners of patches with texture coordinates (P, 3, 2), as columns."""
+    scale = _scale(texture)
+    centres = scale.any() and not is_piecewise_constant(texture, "bitmap")
+    return {f"w{k}": uv[:, k] @ scale[:, :2].T + scale[:, 2] - 0.5 * centres for k in range(3)}
 
 
 def _texels(texture: mi.Texture, uv: np.ndarray) -> np.ndarray:
     """How many texels patches with texture coordinates (P, 3, 2) are long or wide."""
-    return np.abs((uv - np.roll(uv, 1, 1)) @ _scale(texture).T).max((1, 2))
+    return np.abs((uv - np.roll(uv, 1, 1)) @ _scale(texture)[:, :2].T).max((1, 2))

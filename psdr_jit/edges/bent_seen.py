@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, towards_viewer, viewpoint
-from .bent_cells import Cell, Cells
-from .bent_looks import Looks, Seen, least, most, whole_patch
+from .bent_cells import Cell, Cells, uniform_cell
+from .bent_looks import ON_TRIANGLE, Looks, Seen, least, most
 from .bent_rows import BentRows
 from .bent_surface import BentSurface
 from .film_cover import LEAST_LENGTH, LENS_CENTRE, PatchOnFilm
@@ -42,7 +42,8 @@ class SeenPatches:
 
     @cached_property
     def looks(self) -> Looks:
-        looks = Looks.of(self.surface, self.rows, whole_patch())
+        places = [mi.Point2f(*place) for place in ON_TRIANGLE.places]
+        looks = Looks.of(self.surface, self.rows, places, ON_TRIANGLE)
         dr.eval(looks.at)
         return looks
 
@@ -52,14 +53,12 @@ class SeenPatches:
         """
         crossed = self.looks.step * self._seen.crossed()
         if self._cells is not None:
-            crossed = dr.select(self._cells.per_side > 0, self._cells.crossed(), crossed)
+            crossed = dr.select(self._cells.number > 0, self._cells.crossed(self.rows), crossed)
         return dr.select(self._may_turn, self._cover(border, TRIES * crossed), 0)
 
-    def cell(self, row: mi.UInt32, t: mi.Float, active: mi.Bool) -> Cell:
-        """The part of `row` that t ∈ [0, 1) picks."""
-        if self._cells is None:
-            return Cell(whole_patch(), mi.Float(1), mi.Float(1), t)
-        return self._cells.pick(row, t, active)
+    def cell(self, row: mi.UInt32, rows: BentRows, t: mi.Float, active: mi.Bool) -> Cell:
+        """The texel of `row` that t ∈ [0, 1) picks; `rows`: what it is like."""
+        return uniform_cell(rows, t, active) if self._cells is None else self._cells.pick(row, rows, t, active)
 
     @cached_property
     def _cells(self) -> Cells | None:

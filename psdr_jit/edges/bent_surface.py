@@ -19,6 +19,7 @@ from ..core.sensor_frame import towards_viewer
 from ..scene.bent_normals import BentMap
 from ..scene.poses import Poses
 from .bent_rows import BentRows
+from .bent_texels import Texels
 from .curves import transform_point
 from .kind_pattern import FAR_SIDE
 from .surface_points import Surface, SurfacePoint, point_of_body, point_of_face, surface_point
@@ -151,11 +152,15 @@ class BentSurface(ABC):
         return Bent(si.p, mi.Normal3f(si.to_world(n)), si.sh_frame.n)
 
     def at(self, rows: BentRows, b: mi.Point2f, side: mi.Float, active: mi.Bool) -> PatchPoint:
-        """The point b as it is seen from a side of n_s."""
+        """The point b as it is seen from a side of n_s, with derivatives on its own texel."""
         step = DIFFERENCE / dr.maximum(rows.texels, 1)
-        places = [b, mi.Point2f(b + mi.Vector2f(step, 0)), mi.Point2f(b + mi.Vector2f(0, step))]
+        texels, steps = Texels.of(rows), []
+        for way in (mi.Vector2f(1, 0), mi.Vector2f(0, 1)):
+            same = dr.all(dr.floor(texels.of_point(b)) == dr.floor(texels.of_point(mi.Point2f(b + step * way))))
+            steps.append(dr.select(same, step, -step))
+        places = [b, mi.Point2f(b + mi.Vector2f(steps[0], 0)), mi.Point2f(b + mi.Vector2f(0, steps[1]))]
         n, *others = (bent.seen_from(side, rows.mirrored) for bent in self.bent_at(rows, places, active))
-        dn = [mi.Vector3f(other - n) / step for other in others]
+        dn = [mi.Vector3f(other - n) / step for other, step in zip(others, steps, strict=True)]
         place = self.place(rows, rows.q(b), active)
         dx = place.towards(rows.q1 - rows.q0), place.towards(rows.q2 - rows.q0)
         return PatchPoint(place.x, dx, n, (dn[0], dn[1]), self.normal(rows, place))

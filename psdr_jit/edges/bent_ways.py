@@ -1,14 +1,18 @@
 """Ways across patches on which the curves are met where bent normals turn from a viewpoint.
 
-Of a patch, t picks one of c² cells (`bent_cells`), with probability p. The cell is cut into k² triangles in b: k = 1
-where it is small against a texel and h = n·(o − x)/|o − x| has one sign at two of its corners and another at the third.
-Of those n of them at whose corners h has different signs, t picks one. With A the corner that is alone on its side, the
-way is r (E(s) − A) from there to a point of the opposite side, and it has one root. Ways meet a curve, per area of b
-and change of h, with the density
+h = n·(o − x)/|o − x| is smooth within a texel (`bent_texels`), and is looked at there only: normals of a bump map step
+at its borders. A way crosses a triangle in b of which one corner, A, is alone on its side of h = 0. It is r (E(s) − A),
+from there to a point of the opposite side, and has one root. The triangle is
 
-    D = p c² k²/n |∇_b h·(E − A)| / r,
+- the patch, where it is small, h has different signs at its corners, and normals do not step on it;
+- else one of those into which the part of a texel is cut that lies in the box of the patch. t picks the texel, with
+  probability p (`bent_cells`), and one of the n triangles at whose corners h has different signs.
 
-as |∂b/∂s × ∂b/∂r| = r/(c k)². Triangles with one sign at all corners are taken to have no curve.
+With the double area a of the triangle in b, ways meet a curve, per area of b and change of h, with the density
+
+    D = p/n |∇_b h·(E − A)| / (r a),
+
+as |∂b/∂s × ∂b/∂r| = r a. Triangles with one sign at all corners are taken to have no curve.
 """
 
 from __future__ import annotations
@@ -18,17 +22,17 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .bent_cells import Cell, cell_corners
-from .bent_looks import Corners
+from .bent_cells import SMALL, Cell
 from .bent_rows import BentRows
 from .bent_surface import BentSurface
+from .bent_texels import Texels, beside, those_that
 from .shading_curve import LoneCorner
 
-#: Size of cells, in texels, that need not be cut where the signs at their corners differ.
-SMALL = 0.5
+#: A texel is cut into twice the square of this number of triangles.
+CUTS = 4
 
-#: Triangles along the side of others: per texel, at least, and at most, as the signs at their corners fill 64 bits.
-CUTS, LEAST_CUTS, MOST_CUTS = 4.0, 4.0, 9.0
+#: Probability of a texel below which too little is left of t to say where on it.
+FEW_BITS = 2.0**-10
 
 #: Least slope that counts, relative to the mean one: a curve that touches a way for once is given up to this.
 FLATTEST = 0.1
@@ -42,7 +46,7 @@ class Way:
     along: mi.Vector2f
     h: tuple[mi.Float, mi.Float]  # cosine between the bent normal and the direction to the viewer at both ends, about
     exists: mi.Bool
-    density: mi.Float  # p c² k²/n
+    density: mi.Float  # p/(n a)
 
     def met(self, r: mi.Float, slope: mi.Vector2f) -> mi.Float:
         """Density D of ways at the share r of this one, per change of h; `slope`: ∂h/∂b."""
@@ -50,37 +54,46 @@ class Way:
         return dr.maximum(dr.abs(dr.dot(slope, self.along)), least) * self.density / r
 
 
-def way_across(surface: BentSurface, rows: BentRows, cell: Cell, view: mi.Vector4f, active: mi.Bool) -> Way:
-    """On which the curve is looked for in a cell; `cell.t` picks it."""
+def way_across(
+    surface: BentSurface, rows: BentRows, t: mi.Float, cell: Cell, view: mi.Vector4f, active: mi.Bool
+) -> Way:
+    """On which the curve is looked for on a patch; t, which has picked the `cell`, picks it."""
 
-    def heights(corners: Corners) -> list[mi.Float]:
-        bent = surface.bent_at(rows, [corners.b0, corners.b1, corners.b2], active)
-        return [surface.height(rows, each, view) for each in bent]
+    def heights(corners: list[mi.Point2f]) -> list[mi.Float]:
+        return [surface.height(rows, bent, view) for bent in surface.bent_at(rows, corners, active)]
 
-    texels = rows.texels / cell.per_side
-    whole = _differ([h > 0 for h in heights(cell.corners)]) & (texels <= SMALL)
-    wish = dr.maximum(dr.ceil(CUTS * texels), LEAST_CUTS)
-    # of cells that are too large for one grid, a part
-    parts = dr.select(whole, 1, dr.ceil(wish / MOST_CUTS))
-    k = dr.select(whole, 1, dr.ceil(wish / parts))
-    t = cell.t * parts * parts
-    part = dr.minimum(dr.floor(t), parts * parts - 1)
-    within = cell.corners.within(cell_corners(mi.UInt32(part), parts))
-    grid = _Grid.of(surface, rows, within, view, mi.UInt32(k), active & ~whole)
-    t = (t - part) * mi.Float(dr.select(whole, 1, grid.number))
-    chosen = dr.minimum(mi.UInt32(t), dr.maximum(grid.number, 1) - 1)
-    triangle = dr.select(whole, 0, grid.triangle(chosen))
-    corners = within.within(cell_corners(triangle, k))
-    h, s = heights(corners), t - mi.Float(dr.select(whole, 0, chosen))
+    texels = Texels.of(rows)
+    small = (rows.texels <= SMALL) & (~rows.steps | (texels.all.count == 1))
+    patch = [mi.Point2f(0, 0), mi.Point2f(1, 0), mi.Point2f(0, 1)]
+    whole = ~texels.has_area | (small & _differ([h > 0 for h in heights(patch)]))
+    grid = _Grid.of(surface, rows, texels, cell, view, active & ~whole)
+    left = cell.t * mi.Float(grid.number)
+    chosen = dr.minimum(mi.UInt32(left), dr.maximum(grid.number, 1) - 1)
+    left = dr.select(cell.pmf < FEW_BITS, hashed(t, rows.part), left - mi.Float(chosen))
+    s = dr.clip(dr.select(whole, t, left), 0, dr.one_minus_epsilon(mi.Float))
+    triangle = grid.corners(grid.triangle(chosen))
+    corners = [mi.Point2f(dr.select(whole, a, b)) for a, b in zip(patch, triangle, strict=True)]
+    h = heights(corners)
     up = [value > 0 for value in h]
     lone = LoneCorner.of(up)
     a, e = (lone.at(s, mi.Float(r)) for r in (0, 1))
-    start = corners.at(a)
-    ends = tuple(h[0] + b.x * (h[1] - h[0]) + b.y * (h[2] - h[0]) for b in (a, e))
-    share = dr.select(whole, 1, dr.square(k) / mi.Float(dr.maximum(grid.number, 1)))
-    density = cell.pmf * dr.square(cell.per_side) * share
+    start, end = (mi.Point2f(_blended(corners, b)) for b in (a, e))
+    density = dr.select(whole, 1, cell.pmf / (mi.Float(grid.number) * grid.double_area))
     exists = active & _differ(up) & (whole | (grid.number > 0))
-    return Way(start, mi.Vector2f(corners.at(e) - start), ends, exists, density)
+    return Way(start, mi.Vector2f(end - start), (_blended(h, a), _blended(h, e)), exists, density)
+
+
+def hashed(t: mi.Float, salt: mi.UInt32) -> mi.Float:
+    """Another number that is uniform in [0, 1)."""
+    return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, t), salt)
+
+
+def on_patch(b: mi.Point2f) -> mi.Bool:
+    return (b.x >= 0) & (b.y >= 0) & (b.x + b.y <= 1)
+
+
+def _blended(values: list, b: mi.Point2f):
+    return values[0] + b.x * (values[1] - values[0]) + b.y * (values[2] - values[0])
 
 
 def _differ(up: list[mi.Bool]) -> mi.Bool:
@@ -89,54 +102,59 @@ def _differ(up: list[mi.Bool]) -> mi.Bool:
 
 @dataclass
 class _Grid:
-    """A triangle cut into k² others, by number as of `cell_corners`."""
+    """The part of a texel, cut into squares and each of these into two triangles."""
 
-    k: mi.UInt32
-    up: mi.UInt64  # bit i (i + 1)/2 + j: is h > 0 at the corner b = (i − j, j)/k?
+    texels: Texels
+    cell: Cell
+    up: mi.UInt32  # bit by corner of the squares: is h > 0?
     number: mi.UInt32  # of triangles at whose corners it has different signs
 
     @staticmethod
     def of(
-        surface: BentSurface, rows: BentRows, corners: Corners, view: mi.Vector4f, k: mi.UInt32, active: mi.Bool
+        surface: BentSurface, rows: BentRows, texels: Texels, cell: Cell, view: mi.Vector4f, active: mi.Bool
     ) -> _Grid:
-        points = (k + 1) * (k + 2) // 2
+        width = dr.width(cell.low, cell.t)
+        grid = _Grid(texels, cell, dr.zeros(mi.UInt32, width), mi.UInt32(0))
 
-        def look(number: mi.UInt32, i: mi.UInt32, j: mi.UInt32, up: mi.UInt64) -> tuple:
-            b = corners.at(mi.Point2f(mi.Float(i - j), mi.Float(j)) / mi.Float(k))
-            above = surface.height(rows, surface.bent(rows, b, active), view) > 0
-            up |= dr.select(above, mi.UInt64(1) << mi.UInt64(number), 0)
-            last = i == j
-            return number + 1, dr.select(last, i + 1, i), dr.select(last, 0, j + 1), up
+        def look(k: mi.UInt32, up: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+            above = surface.height(rows, surface.bent(rows, grid.at(k), active), view) > 0
+            return k + 1, up | dr.select(above, mi.UInt32(1) << k, 0)
 
-        width = dr.width(corners.b0, k)
-        state = (*(dr.zeros(mi.UInt32, width) for _ in range(3)), dr.zeros(mi.UInt64, width))
-        goes_on = lambda number, *_: active & (number < points)  # noqa: E731
-        up = dr.while_loop(state, goes_on, look, label="where bent normals turn away")[3]
-        grid = _Grid(k, up, mi.UInt32(0))
-        grid.number = grid._crossed(mi.UInt32(0xFFFFFFFF), active)[1]
+        goes_on = lambda k, up: active & (k < (CUTS + 1) ** 2)  # noqa: E731
+        state = dr.zeros(mi.UInt32, width), grid.up
+        grid.up = dr.while_loop(state, goes_on, look, label="where bent normals turn away")[1]
+        grid.number = grid._crossed(mi.UInt32(2 * CUTS**2), active)[1]
         return grid
+
+    @property
+    def double_area(self) -> mi.Float:
+        """Of a triangle, in b."""
+        size = self.cell.high - self.cell.low
+        return size.x * size.y / (CUTS**2 * self.texels.area)
+
+    def at(self, corner: mi.UInt32) -> mi.Point2f:
+        """b of a corner of the squares."""
+        place = mi.Point2f(mi.Float(corner % (CUTS + 1)), mi.Float(corner // (CUTS + 1))) / CUTS
+        return self.texels.on_patch(mi.Point2f(self.cell.low + place * (self.cell.high - self.cell.low)))
+
+    def corners(self, triangle: mi.UInt32) -> list[mi.Point2f]:
+        return [self.at(corner) for corner in self._numbers(triangle)]
 
     def triangle(self, which: mi.UInt32) -> mi.UInt32:
         """Of those with different signs, the one so many places after the first."""
         return self._crossed(which, mi.Bool(True))[0] - 1
 
-    def _crossed(self, which: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
-        """Triangles are looked at up to this one of those with different signs: how many, and how many of those."""
+    def _numbers(self, triangle: mi.UInt32) -> list[mi.UInt32]:
+        square, upper = triangle >> 1, (triangle & 1) != 0
+        first = square + square // CUTS
+        other = first + CUTS + 1
+        return [dr.select(upper, other + 1, first), first + 1, other]
 
-        def goes_on(number: mi.UInt32, found: mi.UInt32) -> mi.Bool:
-            return active & (number < self.k * self.k) & (found <= which)
+    def _crossed(self, before: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        """Those with different signs, and a part of the patch: see `those_that`."""
 
-        def look(number: mi.UInt32, found: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-            return number + 1, found + dr.select(self._differs(number), mi.UInt32(1), 0)
+        def fits(triangle: mi.UInt32) -> mi.Bool:
+            differs = _differ([(self.up >> k) & 1 != 0 for k in self._numbers(triangle)])
+            return differs & ~beside(self.corners(triangle))
 
-        width = dr.width(self.k, self.up, which)
-        state = dr.zeros(mi.UInt32, width), dr.zeros(mi.UInt32, width)
-        return dr.while_loop(state, goes_on, look, label="triangles with a curve")
-
-    def _differs(self, number: mi.UInt32) -> mi.Bool:
-        corners = cell_corners(number, mi.Float(1))
-        return _differ([self._is_up(b) for b in (corners.b0, corners.b1, corners.b2)])
-
-    def _is_up(self, b: mi.Point2f) -> mi.Bool:
-        i, j = mi.UInt32(b.x + b.y + 0.5), mi.UInt32(b.y + 0.5)
-        return (self.up >> mi.UInt64(i * (i + 1) // 2 + j)) & 1 != 0
+        return those_that(fits, mi.UInt32(2 * CUTS**2), before, active)

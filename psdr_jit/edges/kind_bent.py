@@ -25,7 +25,7 @@ from .bent_looks import ASIDE, UNLIKELY
 from .bent_rows import BentRows
 from .bent_seen import SeenPatches
 from .bent_surface import BentSurface, PatchPoint
-from .bent_ways import way_across
+from .bent_ways import on_patch, way_across
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Use, Views
 from .lights import LightBounds
 from .location import EdgeLocation
@@ -86,7 +86,7 @@ class BentOutlines(EdgeKind):
 
     def on(self, row: mi.UInt32, t: mi.Float, view: mi.Vector4f, active: mi.Bool) -> OnEdge:
         rows = dr.gather(BentRows, self.rows, row, active)
-        way = way_across(self.surface, rows, self.seen.cell(row, t, active), view, active)
+        way = way_across(self.surface, rows, t, self.seen.cell(row, rows, t, active), view, active)
         r = self.surface.turns_away(rows, way.start, way.along, way.h, view, way.exists)
         b = mi.Point2f(way.start + r * way.along)
         bent = self.surface.bent(rows, b, way.exists)
@@ -96,7 +96,7 @@ class BentOutlines(EdgeKind):
         distance = dr.norm(towards)
         slope = mi.Vector2f(*(dr.dot(n, towards) - view.w * dr.dot(at.n, x) for n, x in zip(at.dn, at.dx, strict=True)))
         ω = -towards / distance
-        crosses = way.exists & (dr.abs(dr.dot(at.n, ω)) < CLOSE)
+        crosses = way.exists & on_patch(b) & (dr.abs(dr.dot(at.n, ω)) < CLOSE)
         return self._point(rows, at, b, side, ω, at.density / way.met(r, slope / distance), crosses)
 
     def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:

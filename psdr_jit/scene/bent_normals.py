@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .delta_lobes import BENT_NORMALS
-from .graph import child_objects
+from .graph import child_objects, is_piecewise_constant
 from .names import plugin_name
 
 
@@ -24,6 +24,11 @@ class BentMap:
     @property
     def texture(self) -> mi.Texture:
         return next(child for child in child_objects(self.node) if isinstance(child, mi.Texture))
+
+    @property
+    def steps(self) -> bool:
+        """Do normals step from texel to texel?"""
+        return plugin_name(self.node) == "bumpmap" or is_piecewise_constant(self.texture, plugin_name(self.texture))
 
     def normal(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
         """The bent normal in the shading frame, of unit length and before Mitsuba turns those that face away from the

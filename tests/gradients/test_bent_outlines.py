@@ -4,6 +4,8 @@ that are seen aslant.
 
 from __future__ import annotations
 
+from functools import partial
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -37,8 +39,8 @@ def one_tilt() -> dict:
     return {"type": "normalmap", "normalmap": picture(n), "bsdf": {"type": "diffuse", "reflectance": 0.6}}
 
 
-def bumps() -> dict:
-    heights = picture(np.random.default_rng(4).random((8, 8, 1)))
+def bumps(texels: int = 8) -> dict:
+    heights = picture(np.random.default_rng(4).random((texels, texels, 1)))
     return {"type": "bumpmap", "heights": heights, "scale": 0.3, "bsdf": {"type": "diffuse", "reflectance": 0.6}}
 
 
@@ -66,6 +68,7 @@ CASES = [
     pytest.param("sphere", normals, ball, ABOVE, "body.to_world", MOVED, 1024, id="moved ball", marks=slow),
     pytest.param("rectangle", bumps, sheet, ASLANT, "camera.to_world", TURNED, 4096, id="camera", marks=slow),
     pytest.param("disk", steep, sheet, ASLANT, "body.to_world", TURNED, 2048, id="disk", marks=slow),
+    pytest.param("cylinder", partial(bumps, 16), ball, ABOVE, "body.to_world", TURNED, 4096, id="bumps", marks=slow),
     pytest.param("cylinder", normals, ball, ABOVE, "body.to_world", TURNED, 2048, id="cylinder", marks=slow),
 ]
 
