@@ -24,7 +24,7 @@ from ..core.sensor_frame import SensorFrame, towards_viewer
 from .bent_looks import ASIDE, UNLIKELY
 from .bent_rows import BentRows
 from .bent_seen import SeenPatches
-from .bent_surface import BentSurface, PatchPoint
+from .bent_surface import Bent, BentSurface, PatchPoint
 from .bent_ways import on_patch, way_across
 from .kind import EdgeKind, Line, OnEdge, Side, Sight, Use, Views
 from .lights import LightBounds
@@ -33,6 +33,10 @@ from .points import clearance, facing
 
 #: Sine up to which a root is one: beyond, h steps across 0.
 CLOSE = 1e-4
+
+#: Cosine between the view and the normal before bending up to which the curve is taken to be where that one turns away
+#: itself: normals that are not bent do so at the outline, or where smooth shading ends, which are edges of their own.
+NOT_BENT = 2e-4
 
 #: Step to the side at which the radiance of the surface is taken, in units of b per texel.
 STEP_ASIDE = 2e-3
@@ -97,6 +101,7 @@ class BentOutlines(EdgeKind):
         slope = mi.Vector2f(*(dr.dot(n, towards) - view.w * dr.dot(at.n, x) for n, x in zip(at.dn, at.dx, strict=True)))
         ω = -towards / distance
         crosses = way.exists & on_patch(b) & (dr.abs(dr.dot(at.n, ω)) < CLOSE)
+        crosses &= _is_bent(bent, ω)
         return self._point(rows, at, b, side, ω, at.density / way.met(r, slope / distance), crosses)
 
     def line(self, row: mi.UInt32, t: mi.Float, u: mi.Point2f, views: Views, active: mi.Bool) -> Line:
@@ -117,7 +122,7 @@ class BentOutlines(EdgeKind):
         sin, cos = dr.sincos(φ)
         ω = mi.Vector3f(cos * inwards + sin * dr.cross(at.n, inwards))
         pdf = dr.rcp(dr.select(both, dr.two_pi, dr.pi))
-        on = self._point(rows, at, b, side, ω, at.density / 2, active)
+        on = self._point(rows, at, b, side, ω, at.density / 2, active & _is_bent(bent, ω))
         return Line(on, ω, pdf, dr.select(both & ~rows.mirrored, pdf, 0))
 
     def _point(self, rows, at: PatchPoint, b: mi.Point2f, side, ω: mi.Vector3f, weight: mi.Float, valid) -> OnEdge:
@@ -174,3 +179,8 @@ class BentOutlines(EdgeKind):
         _, _, here = self._located(row, at, active)
         m = here.gradient(ω)
         return mi.Vector3f(-here.n * dr.select(active, dr.dot(m, n_perp) / dr.squared_norm(m), 0))
+
+
+def _is_bent(at: Bent, ω: mi.Vector3f) -> mi.Bool:
+    """Does the normal turn from ω somewhere else than it would if it were not bent?"""
+    return dr.abs(dr.dot(at.n_s, ω)) > NOT_BENT

@@ -11,6 +11,7 @@ from fuzz.scenes import Case, case_of
 
 SALT = 0xBE27  # keeps these streams apart from others with the same seeds
 SHARE = 0.6  # of the shapes; of each scene, one at least
+FLAT_IN_PART = 0.3  # of the normal maps
 TEXELS = {3: 3, 6: 3, 16: 2, 60: 1}  # along a side of a map
 MOVES = ("vertex_positions", "to_world", "x_fov", "aperture_radius", "focus_distance", "position", "direction")
 
@@ -49,6 +50,8 @@ def _below_map(draw: Draw, bsdf: dict) -> dict:
         return {"type": "bumpmap", "arbitrary": picture, "scale": draw.number(0.02, 0.6) / side, "bsdf": bsdf}
     steep = draw.one([0.1, 0.3, 0.8])
     bent = np.stack([draw.rng.uniform(-steep, steep, (side, side)) for _ in range(2)] + [np.ones((side, side))], -1)
+    if draw.chance(FLAT_IN_PART):
+        bent[: side // 2 + 1, :, :2] = 0
     bent = 0.5 + 0.5 * bent / np.linalg.norm(bent, axis=-1, keepdims=True)
     picture = {"type": "bitmap", "texels": np.round(bent, 3).tolist()}
     return {"type": "normalmap", "normalmap": picture, "flip_invalid_normals": draw.chance(0.8), "bsdf": bsdf}

@@ -6,6 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from edge_oracle import icosphere
+from helpers import mesh_of
 from variants import also
 
 from psdr_jit.core.sensor_frame import viewpoint
@@ -38,14 +40,18 @@ def picture(values: np.ndarray) -> dict:
     return {"type": "bitmap", "bitmap": mi.Bitmap(values.astype(np.float32)), "raw": True}
 
 
-def outlines(plugin: str, bsdf: dict) -> tuple[BentOutlines, mi.Vector4f]:
+def below(bsdf: dict, plugin: str) -> dict:
+    return {"type": plugin, "bsdf": {"type": "twosided", "of": bsdf}}
+
+
+def outlines(body: dict | mi.Mesh) -> tuple[BentOutlines, mi.Vector4f]:
     """Of a shape below a map, and where it is seen from."""
     pose = mi.ScalarTransform4f().look_at([2.4, 0.3, 1.2], [0, 0, 0], [0, 0, 1])
     sensor = {"type": "perspective", "to_world": pose, "film": {"type": "hdrfilm", "width": 16, "height": 16}}
-    body = {"type": plugin, "bsdf": {"type": "twosided", "of": bsdf}}
     scene = mi.load_dict({"type": "scene", "body": body, "sky": {"type": "constant"}, "sensor": sensor}, optimize=False)
     integrator = integrator_specs.build({"type": "psdr_path", "max_depth": 2, "sppc": 1})
-    with also_enabled(scene, ["body.to_world"]):
+    moved = "vertex_positions" if isinstance(body, mi.Mesh) else "to_world"
+    with also_enabled(scene, [f"body.{moved}"]):
         job = prepare(integrator.call(scene, scene.sensors()[0], 0, 1)).jobs[0][1]
         (kind,) = (k for k in scene_edges(job).kinds if isinstance(k, BentOutlines))
     return kind, viewpoint(job.frame, mi.Point2f(0.5))
@@ -88,7 +94,7 @@ def assert_weights(
 ])  # fmt: skip
 def test_points_and_what_they_weigh(plugin, texels):
     """Patches are small against texels, or about as large."""
-    assert_weights(*outlines(plugin, normal_map(texels)))
+    assert_weights(*outlines(below(normal_map(texels), plugin)))
 
 
 @pytest.mark.parametrize(("plugin", "texels", "most"), [
@@ -100,7 +106,7 @@ def test_patches_of_many_texels(plugin, texels, most, monkeypatch):
     monkeypatch.setattr(bent_rows, "MOST_PATCHES", 64)
     monkeypatch.setattr(bent_cells, "LEAST_CELLS", 0)
     monkeypatch.setattr(bent_cells, "MOST_CELLS", most)
-    kind, view = outlines(plugin, normal_map(texels))
+    kind, view = outlines(below(normal_map(texels), plugin))
     assert dr.all(bent_texels.Texels.of(kind.rows).all.number.x > 4)
     assert_weights(kind, view, 4096, 128)
 
@@ -108,4 +114,13 @@ def test_patches_of_many_texels(plugin, texels, most, monkeypatch):
 @pytest.mark.parametrize(("plugin", "texels", "grid"), [("sphere", 20, 64), also("rectangle", 100, 32)])
 def test_normals_that_step(plugin, texels, grid):
     """Those of a bump map do from texel to texel: with no regard to them, 12 to 27 % of the curves are lost."""
-    assert_weights(*outlines(plugin, bump_map(texels)), 256, grid, 0.001)
+    assert_weights(*outlines(below(bump_map(texels), plugin)), 256, grid, 0.001)
+
+
+def test_normals_that_are_not_bent_have_no_curve():
+    """Where those turn from the viewer is an outline, or that of smooth shading, which are edges already."""
+    flat = np.full((4, 4, 3), [0.5, 0.5, 1])
+    bsdf = {"type": "normalmap", "normalmap": picture(flat), "bsdf": {"type": "diffuse"}}
+    kind, view = outlines(mesh_of(*icosphere(3), normals=True, mesh_bsdf=bsdf))
+    t = mi.PCG32(kind.count).next_float32()
+    assert dr.none(kind.on(dr.arange(mi.UInt32, kind.count), t, view, mi.Bool(True)).valid)
