@@ -20,7 +20,7 @@ from .bent_surface import BentSurface
 from .bent_texels import Block, Texels, those_that
 
 #: Blocks of all patches together, about: per pixel, at least and at most. They are larger if there would be more.
-PER_PIXEL, LEAST_CELLS, MOST_CELLS = 16, 2**17, 2**21
+PER_PIXEL, LEAST_CELLS, MOST_CELLS = 4, 2**17, 2**21
 
 #: Size of patches that are not cut, in texels.
 SMALL = 0.5
