@@ -77,11 +77,11 @@ class Cells:
         of_row = Texels.of(own)
         block = _block(of_row, index - dr.gather(mi.UInt32, first, row), side)
         low, high = of_row.rectangle(block)
-        places = [of_row.on_patch(mi.Point2f(low + mi.Point2f(*at) * (high - low))) for at in IN_RECTANGLE.places]
+        places = [of_row.inside(low, high, mi.Point2f(*place)) for place in IN_RECTANGLE.places]
         looks = Looks.of(surface, own, places, IN_RECTANGLE)
         size = dr.norm(high - low) / (mi.Float(side) * dr.sqrt(2.0))
         weight = looks.seen(eye, slack).crossed() * dr.maximum(looks.step, LEAST_STEP) * size
-        weight = dr.select(of_row.is_on_patch(block), weight, 0)
+        weight = dr.select(of_row.holds(block), weight, 0)
         cdf = dr.cumsum(mi.Float64(weight))
         dr.eval(first, weight, cdf)
         return Cells(first, number, side, weight, cdf)
@@ -139,7 +139,7 @@ def _one_texel(texels: Texels, block: Block, pmf: mi.Float, t: mi.Float, active:
     """Of those of a block of probability `pmf` that may hold a part of the patch, each with the same one."""
 
     def fits(which: mi.UInt32) -> mi.Bool:
-        return texels.is_on_patch(block.texel(which))
+        return texels.holds(block.texel(which))
 
     every = mi.UInt32(block.count)
     number = dr.maximum(those_that(fits, every, every, active)[1], 1)

@@ -77,16 +77,17 @@ class Texels:
     def of_point(self, b: mi.Point2f) -> mi.Point2f:
         return mi.Point2f(self.w0 + b.x * self.d1 + b.y * self.d2)
 
-    def on_patch(self, w: mi.Point2f) -> mi.Point2f:
-        """b of texel coordinates, also beside the patch."""
+    def inside(self, low: mi.Point2f, high: mi.Point2f, place: mi.Point2f) -> mi.Point2f:
+        """b of a place in a rectangle, given in [0, 1]²; also beside the patch."""
+        w = mi.Point2f(low + place * (high - low))
         v, scale = w - self.w0, dr.rcp(self._determinant)
         return mi.Point2f(v.x * self.d2.y - v.y * self.d2.x, self.d1.x * v.y - self.d1.y * v.x) * scale
 
-    def is_on_patch(self, block: Block) -> mi.Bool:
-        """May it hold a part of the patch?"""
+    def holds(self, block: Block) -> mi.Bool:
+        """May a block hold a part of the patch?"""
         low, high = self.rectangle(block)
-        corners = (low, mi.Point2f(high.x, low.y), high, mi.Point2f(low.x, high.y))
-        return ~self.has_area | ~beside([self.on_patch(corner) for corner in corners])
+        corners = [self.inside(low, high, mi.Point2f(*place)) for place in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        return ~self.has_area | ~beside(corners)
 
     def rectangle(self, block: Block) -> tuple[mi.Point2f, mi.Point2f]:
         """The part of a block that lies in the box of the patch, and a little inside of its texels: `(low, high)`."""

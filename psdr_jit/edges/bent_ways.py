@@ -59,21 +59,22 @@ def way_across(
 ) -> Way:
     """On which the curve is looked for on a patch; t, which has picked the `cell`, picks it."""
 
-    def heights(corners: list[mi.Point2f]) -> list[mi.Float]:
-        return [surface.height(rows, bent, view) for bent in surface.bent_at(rows, corners, active)]
+    def heights(corners: list[mi.Point2f], asked: mi.Bool) -> list[mi.Float]:
+        return [surface.height(rows, bent, view) for bent in surface.bent_at(rows, corners, asked)]
 
     texels = Texels.of(rows)
     small = (rows.texels <= SMALL) & (~rows.steps | (texels.all.count == 1))
     patch = [mi.Point2f(0, 0), mi.Point2f(1, 0), mi.Point2f(0, 1)]
-    whole = ~texels.has_area | (small & _differ([h > 0 for h in heights(patch)]))
+    whole = ~texels.has_area | (small & _differ([h > 0 for h in heights(patch, active & small)]))
     grid = _Grid.of(surface, rows, texels, cell, view, active & ~whole)
     left = cell.t * mi.Float(grid.number)
     chosen = dr.minimum(mi.UInt32(left), dr.maximum(grid.number, 1) - 1)
-    left = dr.select(cell.pmf < FEW_BITS, hashed(t, rows.part), left - mi.Float(chosen))
+    other = mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, t), rows.part)
+    left = dr.select(cell.pmf < FEW_BITS, other, left - mi.Float(chosen))
     s = dr.clip(dr.select(whole, t, left), 0, dr.one_minus_epsilon(mi.Float))
-    triangle = grid.corners(grid.triangle(chosen))
+    triangle = grid.corners(grid.triangle(chosen, active & ~whole))
     corners = [mi.Point2f(dr.select(whole, a, b)) for a, b in zip(patch, triangle, strict=True)]
-    h = heights(corners)
+    h = heights(corners, active)
     up = [value > 0 for value in h]
     lone = LoneCorner.of(up)
     a, e = (lone.at(s, mi.Float(r)) for r in (0, 1))
@@ -83,12 +84,8 @@ def way_across(
     return Way(start, mi.Vector2f(end - start), (_blended(h, a), _blended(h, e)), exists, density)
 
 
-def hashed(t: mi.Float, salt: mi.UInt32) -> mi.Float:
-    """Another number that is uniform in [0, 1)."""
-    return mi.sample_tea_float32(dr.reinterpret_array(mi.UInt32, t), salt)
-
-
 def on_patch(b: mi.Point2f) -> mi.Bool:
+    """Is b a point of the patch?"""
     return (b.x >= 0) & (b.y >= 0) & (b.x + b.y <= 1)
 
 
@@ -135,14 +132,14 @@ class _Grid:
     def at(self, corner: mi.UInt32) -> mi.Point2f:
         """b of a corner of the squares."""
         place = mi.Point2f(mi.Float(corner % (CUTS + 1)), mi.Float(corner // (CUTS + 1))) / CUTS
-        return self.texels.on_patch(mi.Point2f(self.cell.low + place * (self.cell.high - self.cell.low)))
+        return self.texels.inside(self.cell.low, self.cell.high, place)
 
     def corners(self, triangle: mi.UInt32) -> list[mi.Point2f]:
         return [self.at(corner) for corner in self._numbers(triangle)]
 
-    def triangle(self, which: mi.UInt32) -> mi.UInt32:
+    def triangle(self, which: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Of those with different signs, the one so many places after the first."""
-        return self._crossed(which, mi.Bool(True))[0] - 1
+        return dr.maximum(self._crossed(which, active)[0], 1) - 1
 
     def _numbers(self, triangle: mi.UInt32) -> list[mi.UInt32]:
         square, upper = triangle >> 1, (triangle & 1) != 0

@@ -69,6 +69,7 @@ class BentOutlines(EdgeKind):
         return dr.full(mi.Bool, False, self.count)
 
     def film_weights(self, frame: SensorFrame, border: int) -> mi.Float:
+        """`frame` is that of `seen`."""
         return self.seen.film_weights(border)
 
     def line_weights(self, use: Use) -> mi.Float:
