@@ -48,7 +48,7 @@ def bidirectional_image(call: Call) -> mi.TensorXf | None:
     """The image, detached; None where light subpaths are not traced, and the image is that of `path`."""
     if call.options.light_paths == "off":
         return None
-    facts = analyse(call.scene, call.sensor)
+    facts = analyse(call.scene, call.sensor, memory=call.memory)
     light = plan_light(call.scene, facts, call.options, call.memory)
     if not light.runs:
         return None

@@ -17,19 +17,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.compat import mesh_buffers, mesh_faces
-from ..core.memory import Memory, Slot, key_of, while_unchanged
+from ..core.memory import Memory, Slot, key_of
 from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..plan.job import Job
 from ..scene.names import shown_name
+from ..scene.shading_normals import is_shaded_smoothly
 from . import intersections as cut
 from .contacts import Contact, normals_beside
-from .seams import is_smooth
 from .segments import EdgeSet
 from .solids import Ball, Solid, triangles
 from .standing_rims import Body
@@ -43,12 +41,6 @@ FLUSH = 1e-3
 
 #: Of an integrator: by a question and the names of two shapes that touch, the contact and the answer.
 ANSWERS: Slot[dict[tuple[str, str | int, str | int], tuple[Contact, bool]]] = Slot(dict)
-
-#: Of an integrator: by the name of a light that touches something, its arrays, and whether it is shaded smooth.
-BENT: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
-
-#: Cosine of the angle up to which a normal of a corner is that of its face.
-UNBENT = 1 - 1e-5
 
 
 @dataclass(frozen=True)
@@ -105,10 +97,10 @@ def warn_about_contacts(job: Job, contacts: Touching) -> None:
                 UnsupportedWarning,
                 memory,
             )
-        if job.form == "spatial" and not shaded_smooth(lamp, memory):
+        if job.form == "spatial" and not is_shaded_smoothly(lamp, memory):
             continue
         cure = "keep them apart by a hundredth of their size"
-        cure += " or give it face_normals" if shaded_smooth(lamp, memory) else ", or use form='spatial', or 'auto'"
+        cure += " or give it face_normals" if is_shaded_smoothly(lamp, memory) else ", or use form='spatial', or 'auto'"
         warn_once(
             f"the area light '{shown_name(lamp)}' touches '{shown_name(other)}' or cuts into it: where the two meet, "
             "the derivative of the light on it is wrong and noisy (15 % of the total if there is no other light), and "
@@ -163,22 +155,6 @@ def _warn_about_hidden_lamps(contacts: Touching, memory: Memory) -> None:
             UnsupportedWarning,
             memory,
         )
-
-
-def shaded_smooth(lamp: mi.Shape, memory: Memory) -> bool:
-    """Do Mitsuba's weights of samples of the light follow other normals than those of its faces?"""
-    if not lamp.is_mesh() or not is_smooth(lamp):
-        return False
-    return while_unchanged(memory[BENT], key_of(lamp), list(mesh_buffers(lamp)), lambda: _bent(lamp))
-
-
-def _bent(mesh: mi.Mesh) -> bool:
-    """Is a normal of a corner turned away from that of its face?"""
-    with dr.suspend_grad():
-        faces = mesh_faces(mesh)
-        a, b, c = (mesh.vertex_position(corner) for corner in faces)
-        n = dr.normalize(dr.cross(b - a, c - a))
-        return any(bool(dr.any(dr.dot(n, mesh.vertex_normal(corner)) < UNBENT)[0]) for corner in faces)
 
 
 def _with_lamp(pairs: Iterator[tuple[mi.Shape, mi.Shape]]) -> Iterator[tuple[mi.Shape, mi.Shape]]:

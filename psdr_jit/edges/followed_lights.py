@@ -22,7 +22,7 @@ import numpy as np
 from ..core.memory import Slot
 from ..core.upload import uploaded
 from ..plan.job import Job
-from .contact_limits import shaded_smooth
+from ..scene.shading_normals import is_shaded_smoothly
 from .overlaps import box_of
 from .scene_table import scene_edges
 
@@ -66,7 +66,7 @@ def _found(job: Job) -> FollowedLights | None:
     if not _boxes_touch(job):
         return None
     with dr.suspend_grad():
-        lamps = [lamp for lamp, _ in scene_edges(job).touching.lamps if not shaded_smooth(lamp, job.call.memory)]
+        lamps = [lamp for lamp, _ in scene_edges(job).touching.lamps if not is_shaded_smoothly(lamp, job.call.memory)]
     if not lamps:
         return None
     index = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(lamp.emitter()))[0]) for lamp in lamps]

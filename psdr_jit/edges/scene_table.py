@@ -221,8 +221,7 @@ def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[Edge
 
 def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
     """Where interpolated normals turn away, on the meshes that are shaded with them."""
-    if not any(s.smooth for s in meshes):
-        return []
+    meshes = [s for s in meshes if s.smooth]
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
     if faces is None:
@@ -231,7 +230,7 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
         limit = COARSE if job.scene.environment() is None else COARSE_UNDER_SKY
         # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.
         flips = job.facts.has_delta_emitters and job.options.depth_limit > 2
-        smooth = [(shape, s) for shape, s in zip(shapes, meshes, strict=True) if s.smooth]
+        smooth = list(zip(shapes, meshes, strict=True))
         sends = [shape for shape, s in smooth if not s.is_emitter and (lets_through(shape) or flips)]
         warn_about_coarse(sends, limit, job.call.memory)
         others = [shape for shape, s in smooth if s.delta_lobes or _lets_light_in(job, shape)]
@@ -242,7 +241,7 @@ def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) ->
 def _mirror_horizons(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
     """Where smooth-shaded meshes begin to reflect under their own faces."""
     shapes = edge_shapes(job).shapes
-    mirrors = [s for s in meshes if s.smooth and reflects(shapes[s.index])]
+    mirrors = [s for s in meshes if reflects(shapes[s.index])]
     if job.options.depth_limit < 2 or not mirrors:
         return []
     outside = _seen_from_outside(job, mirrors)

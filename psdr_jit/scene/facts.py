@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, VERTEX_TEXCOORDS
+from ..core.memory import Memory
 from .capabilities import (
     ANALYTIC_SHAPES,
     CURVE_SHAPES,
@@ -38,6 +39,7 @@ from .guard import require_derivatives
 from .instances import require_codes, shape_groups
 from .patterns import missing_on_curves, missing_patterns
 from .pose_faults import shape_pose_fault
+from .shading_normals import is_shaded_smoothly
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class ShapeFacts:
     is_mesh: bool  # has vertex and face buffers; true of "rectangle" as well
     faces: int  # 0 unless is_mesh
     bad_vertices: int  # with NaN or infinite coordinates; 0 while a function is being frozen
-    smooth: bool  # shaded with interpolated vertex normals
+    smooth: bool  # shaded with vertex normals that are not those of its faces, or may become others
     has_texcoords: bool
     is_emitter: bool
     has_medium: bool
@@ -186,18 +188,19 @@ class SceneFacts:
 
 
 def analyse(
-    scene: mi.Scene, sensor: mi.Sensor | int = 0, counts: Callable[[object], bool] = lambda value: True
-) -> SceneFacts:
+    scene: mi.Scene, sensor: mi.Sensor | int = 0, counts: Callable[[object], bool] = lambda value: True,
+    memory: Memory | None = None,
+) -> SceneFacts:  # fmt: skip
     """Collect the facts about `scene` as seen by `sensor` (the sensor itself, or its number).
 
     `counts(value)`: whether a parameter value with gradients enabled counts as such. Gradients that are merely
-    suspended (`dr.suspend_grad`) are enabled. Costs milliseconds and one synchronisation, so it can be repeated
-    whenever parameters change.
+    suspended (`dr.suspend_grad`) are enabled. `memory` keeps what meshes have been found to be. Costs milliseconds and
+    one synchronisation, so it can be repeated whenever parameters change.
     """
     require_derivatives()
     with dr.resume_grad():
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        graph = SceneGraph(scene, sensor, counts)
+        graph = SceneGraph(scene, sensor, counts, memory or Memory())
         scene_shapes = list(scene.shapes())
         groups = shape_groups(graph.nodes())
         require_codes([s for s in scene_shapes if plugin_name(s) in INSTANCING], groups)
@@ -209,9 +212,7 @@ def analyse(
             variant=mi.variant(),
             polarized=mi.is_polarized,
             shapes=tuple(_shape_facts(graph, *place, bad) for place, bad in zip(places, bad_vertices, strict=True)),
-            emitters=tuple(
-                emitter_facts(graph, emitter, i, shapes) for i, emitter in enumerate(scene.emitters())
-            ),
+            emitters=tuple(emitter_facts(graph, e, i, shapes) for i, e in enumerate(scene.emitters())),
             sensor=_sensor_facts(graph, sensor),
             enabled=graph.enabled_names(),
             extent=_extent(scene),
@@ -257,7 +258,7 @@ def _shape_facts(graph: SceneGraph, shape: mi.Shape, index: int, group: str, bad
         is_mesh=is_mesh,
         faces=shape.face_count() if is_mesh else 0,
         bad_vertices=bad_vertices,
-        smooth=is_mesh and kind == "mesh" and shape.has_vertex_normals() and not shape.has_face_normals(),
+        smooth=kind == "mesh" and is_shaded_smoothly(shape, graph.memory, enabled),
         has_texcoords=is_mesh and shape.has_vertex_texcoords(),
         is_emitter=shape.is_emitter(),
         has_medium=shape.is_medium_transition(),

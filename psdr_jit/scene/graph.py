@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.compat import positions_buffer
 from ..core.joining import joined
+from ..core.memory import Memory
 from .capabilities import FRAME_FREE_PLUGINS, JUMPING_PLUGINS
 from .names import plugin_name, traverse
 from .params import parameter_value
@@ -30,9 +31,11 @@ class SceneGraph:
     `mi.traverse` visits a shared object once and under one name; here every owner finds it.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, counts: Callable[[object], bool]):
-        """`counts(value)`: does this parameter value, whose gradients are enabled, count as such?"""
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, counts: Callable[[object], bool], memory: Memory):
+        """`counts(value)`: does this parameter value, whose gradients are enabled, count as such? `memory`: of whoever
+        asks, for what takes long to find out."""
         self._counts = counts
+        self.memory = memory
         params = traverse(scene)
         self._nodes = list(params.hierarchy)  # keeps the nodes, and with them their ids, alive
         self._values: dict[int, dict[str, object]] = {}  # id(node) -> parameter -> value

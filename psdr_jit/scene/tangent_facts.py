@@ -14,6 +14,7 @@ import numpy as np
 from ..core.ad import array_of, tangents
 from ..core.compat import VERTEX_NORMALS, mesh_positions
 from ..core.joining import joined
+from ..core.memory import Memory
 from .facts import SceneFacts, analyse
 
 #: Deviation from a common rigid motion that counts as rounding, relative to the largest speed.
@@ -23,13 +24,13 @@ RIGID = 1e-5
 FRAME = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], float).T
 
 
-def facts_along_tangents(scene: mi.Scene, sensor: mi.Sensor) -> SceneFacts:
+def facts_along_tangents(scene: mi.Scene, sensor: mi.Sensor, memory: Memory | None = None) -> SceneFacts:
     """The facts with only those parameters enabled that have a tangent; none, if all moves as one rigid body."""
-    facts = analyse(scene, sensor, has_tangent)
+    facts = analyse(scene, sensor, has_tangent, memory)
     only_poses = not any(s.material or set(s.shading) - {VERTEX_NORMALS} for s in facts.shapes)
     only_poses &= not any(e.radiance for e in facts.emitters)
     if facts.geometry_moves and only_poses and moves_as_one(scene, sensor, facts):
-        still = analyse(scene, sensor, lambda value: False)
+        still = analyse(scene, sensor, lambda value: False, memory)
         return replace(still, still="everything moves together, as one rigid body")
     return facts if facts.anything_enabled else replace(facts, still="no parameter has a tangent in this direction")
 

@@ -175,7 +175,7 @@ def test_facts_about_shapes_and_emitters():
     scene = load(
         ball={**BALL, "emitter": {"type": "area"}},
         box={"type": "cube", "face_normals": True},
-        smooth={"type": "cube"},
+        crate={"type": "cube"},
         sun={"type": "directional"},
         sky={"type": "constant"},
     )
@@ -185,7 +185,7 @@ def test_facts_about_shapes_and_emitters():
         "floor": ("rectangle", "analytic", True, 2, False),
         "ball": ("sphere", "analytic", False, 0, False),
         "box": ("cube", "mesh", True, 12, False),
-        "smooth": ("cube", "mesh", True, 12, True),
+        "crate": ("cube", "mesh", True, 12, False),  # its vertex normals are those of its faces
     }
     assert {e.name: (e.plugin, e.delta, e.infinite, e.shape >= 0) for e in facts.emitters} == {
         "lamp": ("point", True, False, False),
