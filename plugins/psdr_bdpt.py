@@ -20,7 +20,8 @@ class BidirectionalIntegrator(TermIntegrator):
      * - light_paths
        - |string|
        - `auto`: light subpaths are aimed at surfaces that may focus light and connected to the sensor, where the plan
-         finds such surfaces; `off`: none; `only`: what light subpaths find is left to them alone, for comparison
+         finds such surfaces, and lights that camera paths find worse by way of them (of mirrors and smooth glass, small
+         ones); `off`: none; `only`: what light subpaths find is left to them alone, for comparison
          (Default: auto)
 
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small

@@ -138,7 +138,7 @@ def _as_given(plan: Plan, q: Question) -> Plan:
     needed = {t.name for t in fresh if t.runs}
     missing = needed - {t.name for t in plan.terms if t.runs or t.reason in MAY_BE_OUT}
     missing |= _with_edges(plan, q) & needed
-    film_rests = why_film_rests(q.call, q.facts)
+    film_rests = why_film_rests(q.call, q.facts, plan.light)
     if plan.form in FOLLOWING and film_rests:
         raise OptionError(
             f"the given plan has the form '{plan.form}', but {film_rests}; make it anew with psdr_jit.make_plan"
@@ -163,11 +163,11 @@ def _with_edges(plan: Plan, q: Question) -> set[str]:
 
 def _facts(call: Call) -> SceneFacts:
     if call.options.direction == "any":
-        return analyse(call.scene, call.sensor)
+        return analyse(call.scene, call.sensor, memory=call.memory)
     if call.mode == "backward":
         raise OptionError('direction="known" is for forward mode: backward mode answers for every direction at once; '
                           'use direction="any"')  # fmt: skip
-    return facts_along_tangents(call.scene, call.sensor)
+    return facts_along_tangents(call.scene, call.sensor, call.memory)
 
 
 def _budgets(call: Call) -> dict[str, int]:
@@ -184,12 +184,13 @@ def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     """Terms first, then form and budgets, for which a pilot may have to be run (`pilot.py`)."""
     call, budgets = q.call, q.budgets
     geometry = _geometry(q, call.options.plan == "lean")
-    film_rests = why_film_rests(call, q.facts) or why_film_is_not_tried(call)
+    light = plan_light(call.scene, q.facts, call.options, call.memory)
+    film_rests = why_film_rests(call, q.facts, light) or why_film_is_not_tried(call)
     forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, film_rests)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
         terms = decide(TERMS, q.facts_in(form[0]), call.options, geometry, spp)
-        return make_plan_of(terms, call.options, form, why, plan_light(call.scene, q.facts, call.options, call.memory))
+        return make_plan_of(terms, call.options, form, why, light)
 
     plan = made(budgets, (forms[0], reason), "equal")
     over_film = {t.name for t in TERMS if t.over_film and q.facts.geometry_moves}  # the pilot's probe is a motion

@@ -49,6 +49,10 @@ from .scattering import Mixture, Scattering, delta_probability, reverse_pdf
 #: Fewest surface vertices of a path that light subpaths find: the sensor's own view of a rough surface needs no help.
 SHORTEST = 2
 
+#: Cosine at which the sensor sees a surface, below which its paths are the camera's alone. What is seen slides by
+#: 1/cosθ, and a light subpath meets such places as often as any other (the camera does less often, and where outlines
+#: are round it looks for them: `interior/sphere_rims`).
+ASLANT = 0.02
 
 #: Lobes that keep near the mirrored or bent direction, or in it.
 FOCUSING = ("Glossy", "DeltaReflection", "DeltaTransmission")
@@ -120,6 +124,7 @@ class LightTechnique:
         """The trail behind `si`, the vertex number `k`, which the path leaves by `onward`."""
         first = k == 0
         found = active & (trail.q > 0) & (onward.pdf > 0) & (k < self.longest) & ~(onward.delta & first)
+        found &= ~(first & seen_aslant(si, si.to_world(si.wi)))
         view = pixel_footprint(self.frame, si.p, -si.to_world(si.wi))
         turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, self.mixture, found & ~first & ~onward.delta)
         q = trail.q * dr.select(first, view, turned) * cosine_ratio(si, onward.wo) / onward.pdf
@@ -145,6 +150,11 @@ class LightTechnique:
         """The weight `mis` once there is a third way, `likelier` times as likely."""
         w = dr.select(likelier > 0, 0, mis) if self.exclusive else dr.rcp(dr.rcp(mis) + dr.square(likelier))
         return dr.detach(dr.select(dr.isfinite(w), w, 0))
+
+
+def seen_aslant(si: mi.SurfaceInteraction3f, ω: mi.Vector3f) -> mi.Bool:
+    """Is the surface seen along ω so slantwise that what camera paths find there is left to them? See `ASLANT`."""
+    return dr.abs_dot(si.n, ω) < ASLANT
 
 
 def cosine_ratio(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Float:

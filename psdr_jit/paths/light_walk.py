@@ -33,7 +33,7 @@ from ..core.sensor_frame import View, look_at
 from .bounce import PathLimits, PathState, bounce
 from .delta_step import delta_step
 from .light_source import LightStart
-from .light_technique import SHORTEST, LightTechnique, average, cosine_ratio, focuses
+from .light_technique import SHORTEST, LightTechnique, average, cosine_ratio, focuses, seen_aslant
 from .light_vertices import LightVertices
 from .rays import interaction
 from .scattering import Mixture, Scattering, delta_probability, mixture_pdf
@@ -148,6 +148,7 @@ def _connected(
     bsdf = si.bsdf()
     margin = dr.select(carried.alone, technique.margin, 0)
     seen = active & on_film(technique.frame, view, margin) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    seen &= carried.alone | ~seen_aslant(si, view.ω)
     turn = _Turn.towards(si.to_local(-view.ω), si, bsdf, limits.mixture, seen)
     end = turn.step / view.J_px
     U = carried.U * turn.p * end / technique.ratio

@@ -14,6 +14,7 @@ from ..options import FILM, FOLLOWING, MATERIAL, SPATIAL, Options, of_vertices
 from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts, ShapeFacts
 from .call import Call
+from .light_plan import LightPlan
 from .plan import Geometry
 
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
@@ -65,13 +66,13 @@ def _uneven(shape: ShapeFacts) -> bool:
     return shape.painted or shape.smooth or not flat
 
 
-def why_film_rests(call: Call, facts: SceneFacts) -> str:
-    """Why places on the film cannot follow what is seen; "" if they can."""
+def why_film_rests(call: Call, facts: SceneFacts, light: LightPlan | None) -> str:
+    """Why places on the film cannot follow what is seen, with light subpaths as planned; "" if they can."""
     if not (facts.camera_moves or facts.shapes_move):
         return "camera and shapes rest, and so do places on the film"
     if call.sensor.class_name() not in KINDS:
         return f"places on the film of a '{call.sensor.class_name()}' are not followed"
-    if call.options.light_paths != "off":
+    if light is not None and light.runs:
         return "light subpaths end at places on the film that rest"
     return ""
 

@@ -147,9 +147,8 @@ class Job:
 
     @property
     def orbits(self) -> Orbits | None:
-        """Spheres that carry directions along, read once per render call. None where light subpaths run, which keep
-        directions, and in other forms than the spatial one."""
-        if self.form != "spatial" or self.light is not None:
+        """Spheres that carry directions along, read once per render call. None in other forms than the spatial one."""
+        if self.form != "spatial" or (self.light is not None and self.facts.has_delta_emitters):
             return None
         return self.shared.once(ORBITS, lambda: Orbits.of(self.scene, self.facts))
 
