@@ -148,7 +148,7 @@ class Job:
     @property
     def orbits(self) -> Orbits | None:
         """Spheres that carry directions along, read once per render call. None in other forms than the spatial one."""
-        if self.form != "spatial" or (self.light is not None and self.facts.has_delta_emitters):
+        if self.form != "spatial":
             return None
         return self.shared.once(ORBITS, lambda: Orbits.of(self.scene, self.facts))
 

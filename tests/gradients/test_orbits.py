@@ -21,20 +21,20 @@ TOLERANCE = 1e-4  # of the adjoint identity
 CENTRE, RADIUS = (0.1, 0.85, 0.0), 0.5
 
 
-def scene(material: str, res: int = 16) -> mi.Scene:
+def scene(material: str, res: int = 16, point: bool = False) -> mi.Scene:
     """A ball above a floor, of which the camera sees the floor alone: only by way of this it knows of the ball."""
     T = mi.ScalarTransform4f
-    size = {"width": res, "height": res, "rfilter": {"type": "box"}}
+    pose = T().translate([0.3, 1.2, -2.6]).rotate([1, 0, 0], 20).scale(0.6)
+    lamp = {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": 4.0}}
+    if point:
+        lamp = {"type": "point", "position": [0.3, 1.2, -2.6], "intensity": 4.0}
+    size = {"width": res, "height": res, "rfilter": {"type": "gaussian" if point else "box"}}
     above = T().look_at([0.0, 4.0, -2.2], [0.0, 0.0, -1.3], [0, 1, 0])
     return mi.load_dict({
         "type": "scene",
         "sensor": {"type": "perspective", "fov": 28, "to_world": above, "film": {"type": "hdrfilm", **size}},
         "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(3), "bsdf": {"type": "diffuse"}},
-        "lamp": {
-            "type": "rectangle",
-            "to_world": T().translate([0.3, 1.2, -2.6]).rotate([1, 0, 0], 20).scale(0.6),
-            "emitter": {"type": "area", "radiance": 4.0},
-        },
+        "lamp": lamp,
         "ball": {"type": "sphere", "center": list(CENTRE), "radius": RADIUS, "bsdf": {"type": material}},
     })  # fmt: skip
 
@@ -127,6 +127,19 @@ def test_directions_that_turn_are_less_noisy(llvm, monkeypatch):
     turning = blocks(forward(p, {"type": "psdr_path", **PATHS}, SEEDS, SPP))
     monkeypatch.setattr(Job, "orbits", None)
     resting = blocks(forward(p, {"type": "psdr_path", **PATHS}, SEEDS, SPP))
+    assert turning.var(0, ddof=1).mean() < NOISE_BELOW * resting.var(0, ddof=1).mean()
+
+
+@pytest.mark.slow
+def test_light_subpaths_leave_them_what_they_are(llvm, monkeypatch):
+    """Light of a point by way of the ball is found from the light, and has a flow of its own; all else turns."""
+    p = perturb(scene("conductor", point=True), SEEN[0], direction=SEEN[1])
+    spec = {"type": "psdr_bdpt", "max_depth": 4, "form": "spatial", "sppc": SPP, "sppp": 1, "spps": 1, "sppi": SPP}
+    turning = blocks(forward(p, spec, SEEDS, 0))
+    monkeypatch.setattr(Job, "orbits", None)
+    resting = blocks(forward(p, spec, SEEDS, 0))
+    errors = np.sqrt((turning.var(0, ddof=1) + resting.var(0, ddof=1)) / SEEDS)
+    assert (np.abs(turning.mean(0) - resting.mean(0)) / errors).max() < MOST_SIGMA
     assert turning.var(0, ddof=1).mean() < NOISE_BELOW * resting.var(0, ddof=1).mean()
 
 

@@ -15,6 +15,7 @@ from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.interior import light_traced
 from psdr_jit.paths.light_technique import ASLANT
+from psdr_jit.plan.job import Job
 from psdr_jit.plan.light_plan import LARGE
 
 BODIES = {
@@ -70,13 +71,23 @@ def test_places_on_the_film_follow_where_no_light_is_traced(llvm):
     assert traced.form == "spatial" and "light subpaths" in traced.form_reason
 
 
-def test_light_is_not_connected_to_a_sensor_that_sees_the_surface_aslant(llvm):
-    """Where what is seen slides by 1/cos, light subpaths would come as often as anywhere else."""
-    motion = perturb(scene_of("rough", WIDE), "body.to_world", direction=[1, 0, 0])
+def job_of(scene: mi.Scene) -> Job:
+    """Of the interior term, the ball moved."""
+    motion = perturb(scene, "body.to_world", direction=[1, 0, 0])
     motion.attach()
     alone = {"sppc": 256, "sppp": 0, "sppd": 0, "sppi": 0, "spps": 0}
     integrator = integrator_specs.build({"type": "psdr_bdpt", "max_depth": 4, "form": "spatial", **alone})
-    (_, job), *_ = prepare(integrator.call(motion.scene, motion.scene.sensors()[0], 1, 64)).jobs
+    (_, job), *_ = prepare(integrator.call(motion.scene, motion.scene.sensors()[0], 1, 1)).jobs
+    return job
+
+
+def test_directions_turn_with_spheres_beside_traced_lights(llvm):
+    assert job_of(scene_of("smooth", SMALL)).orbits is not None
+
+
+def test_light_is_not_connected_to_a_sensor_that_sees_the_surface_aslant(llvm):
+    """Where what is seen slides by 1/cos, light subpaths would come as often as anywhere else."""
+    job = job_of(scene_of("rough", WIDE))
     with dr.suspend_grad():
         limits = replace(job.limits, light=job.light)
         records = light_traced.find_paths(job, mi.UInt32(1), 256, limits).turned.records
