@@ -10,10 +10,10 @@ from collections.abc import Iterable
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.compat import VERTEX_NORMALS, VERTEX_POSITIONS, faces_buffer, normals_buffer, positions_buffer
 from ..core.memory import Memory, Slot, key_of, while_unchanged
+from ..core.varying import varying
 
 #: Length of the difference of two unit normals up to which they are the same: files keep few digits.
 SAME = 1e-3
@@ -39,16 +39,19 @@ def is_shaded_smoothly(shape: mi.Shape, memory: Memory, enabled: Iterable[str] =
 
 
 def _has_normals_of_faces(positions: mi.Float, normals: mi.Float, corners: mi.UInt32) -> bool:
-    p, n = (np.array(dr.detach(array), np.float64).reshape(-1, 3) for array in (positions, normals))
-    faces = np.array(corners).reshape(-1, 3)
-    return all(_agree(p[part], n[part]) for part in (faces[:FIRST], faces[FIRST:]))
+    with dr.suspend_grad():
+        count = dr.width(corners) // 3
+        return all(_agree(positions, normals, corners, first, n) for first, n in
+                   ((0, min(FIRST, count)), (FIRST, count - FIRST)) if n > 0)  # fmt: skip
 
 
-def _agree(p: np.ndarray, n: np.ndarray) -> bool:
-    """Do the normals `n` of corners at `p`, both (F, 3, 3), belong to their faces? Those without area have none."""
-    with np.errstate(invalid="ignore"):  # vertices that are no numbers are complained of elsewhere
-        n_g = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    doubled = np.linalg.norm(n_g, axis=-1)
-    there = doubled > 0
-    off = n[there] - (n_g[there] / doubled[there, None])[:, None]
-    return bool((np.linalg.norm(off, axis=-1) <= SAME).all())
+def _agree(positions: mi.Float, normals: mi.Float, corners: mi.UInt32, first: int, count: int) -> bool:
+    """Do the normals at the corners of `count` faces belong to these? Faces without area have none."""
+    face = dr.arange(mi.UInt32, count) + varying(mi.UInt32, first)
+    corner = dr.gather(mi.Vector3u, corners, face)
+    p = [dr.gather(mi.Point3f, positions, k) for k in corner]
+    n_g = dr.cross(p[1] - p[0], p[2] - p[0])
+    doubled = dr.norm(n_g)
+    n_g /= dr.select(doubled > 0, doubled, 1)
+    off = [dr.norm(dr.gather(mi.Normal3f, normals, k) - n_g) for k in corner]
+    return not dr.any((doubled > 0) & ~(dr.maximum(dr.maximum(off[0], off[1]), off[2]) <= SAME))[0]
