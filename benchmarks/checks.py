@@ -93,16 +93,16 @@ def check(case: Case | Listed, seconds: float, **samples: int) -> dict[str, Any]
     v = found.verdict
     film = motion.scene.sensors()[0].film().crop_size()
     if isinstance(case, Listed):
-        bench, about = LISTED, {"list": case.of, "max_stderr": case.stderr}
+        bench, about, method = LISTED, {"list": case.of, "max_stderr": case.stderr}, case.method
     else:
-        bench, about = BENCH, {"scene": case.scene, **case.load}
+        bench, about, method = BENCH, {"scene": case.scene, **case.load}, "psdr_path"
     settings = {
         **about, "parameter": motion.name, "motion": found.direction, "res": int(film[0]), "spp": found.spp,
         "seeds": found.seeds, "reference_spp": found.reference_spp, "reference_seeds": found.reference_seeds,
         "eps": found.eps, "block": found.block,
     }  # fmt: skip
     return {
-        "bench": bench, "case": case.name, "method": "psdr_path", "settings": settings, "verdict": v.verdict,
+        "bench": bench, "case": case.name, "method": method, "settings": settings, "verdict": v.verdict,
         "reason": v.reason, "gain": v.gain, "gain_stderr": v.gain_stderr, "rms_z": v.rms_z, "max_z": v.max_z,
         "blocks": v.blocks, "seconds": found.seconds,
     }  # fmt: skip

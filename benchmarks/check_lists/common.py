@@ -34,6 +34,7 @@ class Listed:
     motion: Motion
     tolerance: float = 0.02
     stderr: float = 0.0068
+    method: str = "psdr_path"
 
 
 def moved(param: str, direction: Any = ALONG, eps: float = MOVE) -> Motion:
@@ -59,8 +60,8 @@ def view(origin: tuple, target: tuple = (0, 0, 0), fov: float = 34) -> dict:
     return {"type": "perspective", "fov": fov, "to_world": pose, "film": film}
 
 
-def scene_of(depth: int, camera: dict, **parts: Any) -> mi.Scene:
-    path = {"type": "path", "max_depth": depth, "rr_depth": 1000}
+def scene_of(depth: int, camera: dict, integrator: str = "path", **parts: Any) -> mi.Scene:
+    path = {"type": integrator, "max_depth": depth, "rr_depth": 1000}
     return mi.load_dict({"type": "scene", "integrator": path, "camera": camera, **parts}, optimize=False)
 
 

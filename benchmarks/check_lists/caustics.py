@@ -1,0 +1,67 @@
+"""What glass and mirrors gather, by `psdr_bdpt`: rough and smooth, below an area light, a spot and a point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import mitsuba as mi
+
+from benchmarks.check_lists.common import ALONG, Listed, Motion, T, ground, moved, scene_of, unit, view
+
+NAME, METHOD = "caustics", "psdr_bdpt"
+FLOOR = -0.9  # height
+AT = (1.1, 2.6, 0.9)  # of the light
+DOWN = {"origin": list(AT), "target": [0.05, 0.1, 0.1], "up": [0.2, 0.1, 1]}
+UP = (0.1, 1.0, 0.05)
+ALPHAS = (0.05, 0.1, 0.2)
+STEP, STEP_OF_BODY = 0.01, 0.004  # a tenth of a pixel, but for what has outlines of its own
+
+
+def light(kind: str) -> dict:
+    if kind == "point":
+        return {"type": "point", "position": list(AT), "intensity": 14.0}
+    pose = T().look_at(**DOWN)
+    if kind == "spot":
+        return {"type": "spot", "to_world": pose, "intensity": 20.0, "cutoff_angle": 28, "beam_width": 12}
+    return {"type": "rectangle", "to_world": pose.scale(0.12), "emitter": {"type": "area", "radiance": 300.0},
+            "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
+
+
+def body(kind: str, bsdf: dict) -> dict:
+    if kind == "ball":
+        return {"type": "sphere", "center": [0.05, 0.1, 0.1], "radius": 0.7, "bsdf": bsdf}
+    pose = T().translate([0.05, 0.1, 0.1]).rotate(unit(0.3, 1, 0.2), 31).scale([0.9, 0.15, 0.7])
+    return {"type": "cube", "to_world": pose, "bsdf": bsdf}
+
+
+def scene(kind: str, bsdf: dict, lit: str) -> mi.Scene:
+    """A body between a light and a floor."""
+    camera = view((0.9, 2.3, 4.2), (0, -0.4, 0))
+    parts = {"body": body(kind, bsdf), "floor": ground(FLOOR), "lamp": light(lit)}
+    return scene_of(5, camera, METHOD, **parts)
+
+
+def motions(kind: str, lit: str, index: bool) -> Iterator[tuple[str, Motion]]:
+    if index:
+        yield "index", Motion("body.bsdf.eta", STEP, 1.0)
+    yield "light moved", moved("lamp.position" if lit == "point" else "lamp.to_world", ALONG, STEP)
+    yield "body moved", moved("body.to_world" if kind == "ball" else "body.vertex_positions", ALONG, STEP_OF_BODY)
+    yield "floor lifted", moved("floor.to_world", UP, STEP)
+
+
+def caustics() -> Iterator[Listed]:
+    for kind in ("slab", "ball"):
+        for alpha in ALPHAS:
+            glass = {"type": "roughdielectric", "alpha": alpha, "distribution": "ggx", "int_ior": 1.5}
+            yield from _cases(f"rough glass {kind} {alpha}", kind, glass, ("area", "spot"), True)
+    lights = ("area", "spot", "point")
+    yield from _cases("smooth glass ball", "ball", {"type": "psdr_dielectric", "int_ior": 1.5}, lights, True)
+    yield from _cases("mirror ball", "ball", {"type": "conductor"}, lights, False)
+
+
+def _cases(name: str, kind: str, bsdf: dict[str, Any], lights: tuple[str, ...], index: bool) -> Iterator[Listed]:
+    for lit in lights:
+        for what, motion in motions(kind, lit, index):
+            yield Listed(NAME, f"{name}, {lit}, {what}", partial(scene, kind, bsdf, lit), motion, method=METHOD)
