@@ -2,7 +2,7 @@
 
 What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that
 scatter in or near the mirrored or bent direction (`paths.light_technique.focuses`); a scene without any is left to
-camera paths.
+camera paths, and so are lamps that look wide from what mirrors or bends light without scattering it.
 """
 
 from __future__ import annotations
