@@ -21,7 +21,7 @@ from psdr_jit.driver.terms import TERMS
 from psdr_jit.errors import OptionError
 from psdr_jit.options import FOLLOWS
 from psdr_jit.paths.aovs import Aovs
-from psdr_jit.plan.light_plan import narrow_shapes
+from psdr_jit.plan.light_plan import focusing_shapes
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene.facts import analyse
 
@@ -121,9 +121,8 @@ def build_term(spec: Mapping[str, Any], term: str) -> Any:
 def reference(spec: Mapping[str, Any], scene: Any) -> Any:
     """What finite differences are taken of: Mitsuba's `path`, or what `image_plugin` says, with the options of `spec`.
 
-    Where `psdr_bdpt` shows what `path` does not, light of points by way of mirrors and smooth glass, or hardly ever, of
-    rough ones: `psdr_bdpt`.
-    With `aovs`, Mitsuba's `aov` around it.
+    `psdr_bdpt` where it shows what `path` does not, light of points by way of mirrors and smooth glass, or hardly ever
+    finds, that by way of rough ones. With `aovs`, Mitsuba's `aov` around it.
     """
     if spec.get("aovs"):
         inner = {key: value for key, value in spec.items() if key != "aovs"}
@@ -131,7 +130,7 @@ def reference(spec: Mapping[str, Any], scene: Any) -> Any:
     options = {k: spec[k] for k in PATH_OPTIONS if k in spec}
     if spec.get("type") == "psdr_bdpt" and spec.get("light_paths") != "off":
         facts = analyse(scene)
-        if facts.has_delta_emitters and narrow_shapes(facts):
+        if facts.has_delta_emitters and focusing_shapes(scene, facts):
             return build({"type": "psdr_bdpt", **options})
     return build({"type": image_plugin(scene, bool(options.get("hide_emitters", False))), **options})
 

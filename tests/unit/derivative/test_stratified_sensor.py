@@ -65,12 +65,22 @@ def test_differences_have_less_noise(variant):
     assert 0 < noise[SAMPLER] < 0.5 * noise[OWN]
 
 
-def test_light_subpaths_keep_their_sensor(variant):
-    """Where `psdr_bdpt` is its own reference, it draws its random numbers itself."""
-    mirror = {"type": "rectangle", "bsdf": {"type": "conductor"}}
+def below_a_point(bsdf: str) -> Perturbation:
+    mirror = {"type": "rectangle", "bsdf": {"type": bsdf}}
     found = mi.load_dict({"type": "scene", "mirror": mirror, "lamp": {"type": "point", "position": [0, 0, 1]},
                           "camera": {"type": "perspective"}}, optimize=False)  # fmt: skip
-    motion = perturb(found, "mirror.to_world", (1, 0, 0))
+    return perturb(found, "mirror.to_world", (1, 0, 0))
+
+
+@pytest.mark.parametrize(("bsdf", "own"), [("plastic", True), ("null", False), ("diffuse", False)])
+def test_what_sends_the_light_of_points_on_is_in_one_image_alone(llvm, bsdf, own):
+    """What plastic mirrors of it is found from the light, and is not in the image of `path`."""
+    assert (samples_of(below_a_point(bsdf), "psdr_bdpt", 7) == 7) == own
+
+
+def test_light_subpaths_keep_their_sensor(variant):
+    """Where `psdr_bdpt` is its own reference, it draws its random numbers itself."""
+    motion = below_a_point("conductor")
     assert samples_of(motion, "psdr_bdpt", 7) == 7
     assert samples_of(motion, "psdr_path", 7) == stratified_count(7) != 7
 
