@@ -8,12 +8,12 @@ from typing import Any
 
 import mitsuba as mi
 
-from benchmarks.check_lists.common import ALONG, Listed, Motion, T, ground, moved, scene_of, unit, view
+from benchmarks.check_lists.common import ALONG, Listed, Motion, T, glowing, ground, moved, scene_of, unit, view
 
 NAME, METHOD = "caustics", "psdr_bdpt"
 FLOOR = -0.9  # height
-AT = (1.1, 2.6, 0.9)  # of the light
-DOWN = {"origin": list(AT), "target": [0.05, 0.1, 0.1], "up": [0.2, 0.1, 1]}
+AT, CENTRE = (1.1, 2.6, 0.9), (0.05, 0.1, 0.1)  # of the light, of the body
+DOWN = {"origin": list(AT), "target": list(CENTRE), "up": [0.2, 0.1, 1]}
 UP = (0.1, 1.0, 0.05)
 ALPHAS = (0.05, 0.1, 0.2)
 STEP, STEP_OF_BODY = 0.01, 0.004  # a tenth of a pixel, but for what has outlines of its own
@@ -25,14 +25,13 @@ def light(kind: str) -> dict:
     pose = T().look_at(**DOWN)
     if kind == "spot":
         return {"type": "spot", "to_world": pose, "intensity": 20.0, "cutoff_angle": 28, "beam_width": 12}
-    return {"type": "rectangle", "to_world": pose.scale(0.12), "emitter": {"type": "area", "radiance": 300.0},
-            "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
+    return glowing(pose.scale(0.12), 300.0)
 
 
 def body(kind: str, bsdf: dict) -> dict:
     if kind == "ball":
-        return {"type": "sphere", "center": [0.05, 0.1, 0.1], "radius": 0.7, "bsdf": bsdf}
-    pose = T().translate([0.05, 0.1, 0.1]).rotate(unit(0.3, 1, 0.2), 31).scale([0.9, 0.15, 0.7])
+        return {"type": "sphere", "center": list(CENTRE), "radius": 0.7, "bsdf": bsdf}
+    pose = T().translate(list(CENTRE)).rotate(unit(0.3, 1, 0.2), 31).scale([0.9, 0.15, 0.7])
     return {"type": "cube", "to_world": pose, "bsdf": bsdf}
 
 

@@ -72,6 +72,10 @@ def ground(height: float, size: float = 3, **bsdf: Any) -> dict:
 
 def lamp(origin: tuple, size: float, radiance: float) -> dict:
     pose = T().look_at(origin=list(origin), target=[0, 0, 0], up=[0.1, 1, 0.2]).scale(size)
+    return glowing(pose, radiance)
+
+
+def glowing(pose: Any, radiance: float) -> dict:
     return {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": radiance},
             "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
 

@@ -18,6 +18,7 @@ from benchmarks.check_lists.common import (
     Motion,
     T,
     checkered,
+    glowing,
     ground,
     lamp,
     moved,
@@ -127,11 +128,9 @@ def reflected() -> mi.Scene:
     """What a mirror throws onto a wall that the lamp itself does not reach."""
     pose = T().translate([0.1, -0.9, 0.6]).rotate(unit(1, 0.1, 0.2), -78).scale(0.6)
     glow = T().look_at(origin=[0.4, 1.4, 1.6], target=[0.1, -0.9, 0.6], up=[0, 0, 1]).scale(0.35)
-    light = {"type": "rectangle", "to_world": glow, "emitter": {"type": "area", "radiance": 15.0},
-             "bsdf": {"type": "diffuse", "reflectance": 0}}  # fmt: skip
     mirror = {"type": "rectangle", "to_world": pose, "bsdf": MIRROR}
-    screen = wall(-1.4, 4, 2.2, type="diffuse")
-    return scene_of(3, view((0.9, 0.9, 4.3), (0.1, 0.1, -1.4), 40), mirror=mirror, wall=screen, lamp=light)
+    parts = {"mirror": mirror, "wall": wall(-1.4, 4, 2.2, type="diffuse"), "lamp": glowing(glow, 15.0)}
+    return scene_of(3, view((0.9, 0.9, 4.3), (0.1, 0.1, -1.4), 40), **parts)
 
 
 def specular() -> Iterator[Listed]:

@@ -27,6 +27,7 @@ from ..scene.capabilities import COPIES
 from ..scene.graph import named_children
 from ..scene.pose_faults import stretches
 from ..scene.poses import on_host
+from ..scene.shading_normals import interpolates_normals
 
 #: Attributes of meshes, by the first part of their names.
 ATTRIBUTES = ("vertex_", "face_")
@@ -58,7 +59,7 @@ def _volume(matrix: np.ndarray) -> float:
 
 
 def _mesh(child: mi.Mesh, to_world, name: str) -> mi.Mesh:
-    smooth = child.has_vertex_normals() and not child.has_face_normals()
+    smooth = interpolates_normals(child)
     props = mi.Properties()
     props["bsdf"] = child.bsdf()
     props["flip_normals"] = child.has_flipped_normals()

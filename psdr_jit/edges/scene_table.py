@@ -222,10 +222,10 @@ def _reachable(job: Job, rows: EdgeRows, bodies: list[ShapeFacts]) -> tuple[Edge
 def _shading_outlines(job: Job, meshes: list[ShapeFacts], centre: mi.Point3f) -> list[EdgeKind]:
     """Where interpolated normals turn away, on the meshes that are shaded with them."""
     meshes = [s for s in meshes if s.smooth]
+    if not meshes:
+        return []
     shapes = [edge_shapes(job).shapes[s.index] for s in meshes]
     faces = smooth_faces(shapes, [s.moves for s in meshes], _seen_from_outside(job, meshes), job.call.memory)
-    if faces is None:
-        return []
     if job.options.depth_limit > 2 or any(not e.delta for e in job.facts.emitters):  # surfaces are lights as well
         limit = COARSE if job.scene.environment() is None else COARSE_UNDER_SKY
         # Towards a point of light or from one, a whole face turns at once: what others see of that is not sampled.

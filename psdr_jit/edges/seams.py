@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.compat import mesh_buffers, mesh_faces
 from ..core.memory import Memory, Slot, key_of, while_unchanged
+from ..scene.shading_normals import interpolates_normals
 from .copies import attributes
 from .geometry import EdgeTopologyDevice
 from .topology import EdgeTopology, connected_components
@@ -24,10 +25,6 @@ REACH = 2
 #: Of an integrator: by mesh, and whether it is painted, its arrays, the seams (E,) it has had, and its
 #: charts.
 CHARTS: Slot[dict[tuple[str | int, bool], tuple[list, tuple[np.ndarray, np.ndarray | None]]]] = Slot(dict)
-
-
-def is_smooth(mesh: mi.Mesh) -> bool:
-    return mesh.has_vertex_normals() and not mesh.has_face_normals()
 
 
 def corner_vertex(faces: mi.Vector3u, face: mi.UInt32, corner: mi.UInt32) -> mi.UInt32:
@@ -51,7 +48,7 @@ def split_seams(mesh: mi.Mesh, painted: bool, topo: EdgeTopologyDevice, host: Ed
             jump |= dr.norm(other - dr.gather(type(vertex_data), vertex_data, vertex)) > SEAM_TOLERANCE
         return topo.split & jump
 
-    if is_smooth(mesh):
+    if interpolates_normals(mesh):
         found |= jumps(mesh.vertex_normal(dr.arange(mi.UInt32, mesh.vertex_count())))
     if painted and mesh.has_vertex_texcoords():
         found |= jumps(mesh.vertex_texcoord(dr.arange(mi.UInt32, mesh.vertex_count())))

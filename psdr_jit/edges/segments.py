@@ -20,6 +20,7 @@ from ..core.memory import Memory, Slot, key_of
 from ..core.upload import uploaded
 from ..errors import SceneError, UnsupportedWarning
 from ..scene.names import shown_name
+from ..scene.shading_normals import interpolates_normals
 from .coinciding import PointsBetween, divided, join_coinciding
 from .contacts import Contact, find_contacts
 from .flush_faces import trace_in_flush_faces
@@ -28,7 +29,7 @@ from .joined_meshes import JoinedTopology, attached_positions, joined_faces, joi
 from .junctions import JunctionTable, find_junctions
 from .parts import Part, parts_of
 from .rows import EdgeRows
-from .seams import corner_vertex, is_smooth, split_seams
+from .seams import corner_vertex, split_seams
 from .shells import edge_shells
 from .solids import Ball, Drum, Solid
 from .topology import WELD_TOLERANCE, EdgeTopology, build_edge_topology
@@ -210,7 +211,7 @@ def _rows(
     g = edge_geometry(positions, faces, topo)
     shape, shell = together.shape, together.shell
     smooth, moves = (dr.gather(mi.Bool, uploaded(mi.Bool, np.array(flags)), shape)
-                     for flags in ([is_smooth(mesh) for mesh in meshes], moving))  # fmt: skip
+                     for flags in ([interpolates_normals(mesh) for mesh in meshes], moving))  # fmt: skip
     return EdgeRows(
         v0=mi.UInt32(topo.v0),
         v1=mi.UInt32(topo.v1),

@@ -13,8 +13,8 @@ from ..core.joining import joined, joined_points, pointers
 from ..core.memory import Memory
 from ..core.upload import uploaded
 from ..core.varying import varying
+from ..scene.shading_normals import interpolates_normals
 from .joined_meshes import attached_positions, by_face, joined_faces
-from .seams import is_smooth
 from .segments import known_topology
 
 
@@ -57,7 +57,7 @@ def smooth_faces(meshes: list[mi.Mesh], moving: list[bool], outside: mi.Float, m
 
     `outside`, by mesh: 1 if a closed mesh is seen from outside only, else 0.
     """
-    places = [i for i, mesh in enumerate(meshes) if is_smooth(mesh)]
+    places = [i for i, mesh in enumerate(meshes) if interpolates_normals(mesh)]
     chosen = [meshes[i] for i in places]
     if not chosen:
         return None

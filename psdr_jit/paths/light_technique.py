@@ -124,8 +124,9 @@ class LightTechnique:
         """The trail behind `si`, the vertex number `k`, which the path leaves by `onward`."""
         first = k == 0
         found = active & (trail.q > 0) & (onward.pdf > 0) & (k < self.longest) & ~(onward.delta & first)
-        found &= ~(first & seen_aslant(si, si.to_world(si.wi)))
-        view = pixel_footprint(self.frame, si.p, -si.to_world(si.wi))
+        back = si.to_world(si.wi)
+        found &= ~(first & seen_aslant(si, back))
+        view = pixel_footprint(self.frame, si.p, -back)
         turned = reverse_pdf(mi.BSDFContext(), si, bsdf, onward.wo, self.mixture, found & ~first & ~onward.delta)
         q = trail.q * dr.select(first, view, turned) * cosine_ratio(si, onward.wo) / onward.pdf
         if self.delta_lobes:

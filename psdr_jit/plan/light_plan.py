@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.memory import Memory
 from ..core.sensor_frame import KINDS, SensorFrame
@@ -168,14 +167,14 @@ def _worth_tracing(
     if options.light_paths == "only" or scattering & set(targets):
         return lights
     shapes = scene.shapes()
-    centres = [np.array(shapes[k].bbox().center()) for k in targets]
+    centres = [shapes[k].bbox().center() for k in targets]
 
     def small(light: EmitterFacts) -> bool:
         if light.delta or light.shape < 0:
             return True
         box = shapes[light.shape].bbox()
-        area = np.square(box.extents()).sum() / 2
-        return all(area < LARGE * np.square(box.center() - centre).sum() for centre in centres)
+        area = math.hypot(*box.extents()) ** 2 / 2
+        return all(area < LARGE * math.dist(box.center(), centre) ** 2 for centre in centres)
 
     return [k for k in lights if small(facts.emitters[k])]
 

@@ -25,12 +25,17 @@ FIRST = 64
 FLAT_MESHES: Slot[dict[str | int, tuple[list, bool]]] = Slot(dict)
 
 
+def interpolates_normals(mesh: mi.Mesh) -> bool:
+    """Is it shaded with vertex normals, whatever these are?"""
+    return mesh.has_vertex_normals() and not mesh.has_face_normals()
+
+
 def is_shaded_smoothly(shape: mi.Shape, memory: Memory, enabled: Iterable[str] = ()) -> bool:
     """Has it normals of its own, or may it get some as the parameters `enabled` change? Remembered while it rests.
 
     While a function is being frozen, any vertex normals count.
     """
-    if not shape.is_mesh() or not shape.has_vertex_normals() or shape.has_face_normals():
+    if not shape.is_mesh() or not interpolates_normals(shape):
         return False
     if {VERTEX_POSITIONS, VERTEX_NORMALS} & set(enabled) or dr.flag(dr.JitFlag.FreezingScope):
         return True
