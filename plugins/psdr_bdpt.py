@@ -21,7 +21,8 @@ class BidirectionalIntegrator(TermIntegrator):
        - |string|
        - `auto`: light subpaths are aimed at surfaces that may focus light and connected to the sensor, where the plan
          finds such surfaces, and lights that camera paths find worse by way of them (of mirrors and smooth glass, small
-         ones); `off`: none; `only`: what light subpaths find is left to them alone, for comparison
+         ones; of rough ones, skies with a sun); `off`: none; `only`: what light subpaths find is left to them alone,
+         for comparison
          (Default: auto)
 
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small

@@ -202,7 +202,7 @@ class LightLines(SearchedLines):
         cone = towards_sphere(place, *ball)
         if self.sources.around is None:
             return place, cone.axis, cone.density
-        ω = shone(light, far)
+        ω = shone(light, mi.Point2f(0.5), far)
         y = dr.select(far, self.sources.start_of(ball[0], ω), place)
         return y, dr.select(far, ω, cone.axis), dr.select(far, beam_density(ball), cone.density)
 

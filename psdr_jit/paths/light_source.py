@@ -1,13 +1,15 @@
 """Where light subpaths start: on a light, aimed at surfaces that may focus it.
 
 A light is chosen, a point y_0 on it (uniform by area; a point light has one), and a direction ω towards the ball around
-one of the targets, uniform in the cone that the ball is seen in. Rays of a directional light start in front of the
-scene, uniform over the disk across them that hides the ball. What another way of finding the same segment y_0 → y_1
-needs to know of this is one number, the density with the segment's own measure taken out,
+one of the targets, uniform in the cone that the ball is seen in. Rays of a directional light and of the sky start in
+front of the scene, uniform over the disk across them that hides the ball; the sky's direction is one of its own emitter
+sampling. What another way of finding the same segment y_0 → y_1 needs to know of this is one number, the density with
+the segment's own measure taken out,
 
     E = P p_A(y_0) p(ω) / |cosθ_0|          area light; per m² sr, and per unit of cosine
     E = P p(ω) / r²                         point and spot light
     E = P p_⊥(y_0)                          directional light
+    E = P p_⊥(y_0) p_sky(−ω)                sky: environment map or constant; per m² sr
 
 P the probability of the light, p(ω) = Σ_i [ω in cone i] / (n Ω_i) over the n targets, p_⊥(y_0) = Σ_i [the ray from y_0
 meets ball i] / (n π R_i²), θ_0 between ω and the light's normal, r the distance. In this measure what the segment
@@ -54,10 +56,11 @@ class LightSources:
 
     ids: mi.UInt32  # registry indices of the lights, each as likely as the others
     shapes: mi.UInt32  # and of their shapes, 0: none
-    density: mi.Float  # by registry index: P p_A(y_0) of an area light, P of a delta light; 0: not traced
+    density: mi.Float  # by registry index: P p_A(y_0) of an area light, P of all others; 0: not traced
     choice: mi.Float  # by registry index: probability with which next-event estimation chooses the light
     targets: tuple[Ball, ...]
     around: Ball | None = None  # the scene, if rays from far away are among what is traced
+    sky: bool = False  # the sky is
 
     def sample(self, sampler, wavelengths) -> LightStart:
         """One light subpath for each lane of `sampler`."""
@@ -76,9 +79,12 @@ class LightSources:
         ω = self._aim(si.p, u_target, v)
         if self.around is not None:
             far = is_far(emitter)
-            ω = dr.select(far, shone(emitter, far), ω)
+            ω = dr.select(far, shone(emitter, u, far), ω)
             si.p = dr.select(far, self._from_afar(ω, u_target, v), si.p)
+            si.n = dr.select(far & ~delta, ω, si.n)
         si.wi = si.to_local(ω)
+        if self.sky:
+            si.wi = dr.select(far, ω, si.wi)
         radiance = emitter.eval(si, ~delta)
         ray = si.spawn_ray(ω)
         ray.wavelengths = wavelengths
@@ -129,8 +135,12 @@ class LightSources:
         measure = dr.select(dr.all(n == 0), dr.rcp(dr.square(r)), dr.rcp(dr.abs_dot(n, ω)))
         E = light * self._aimed_pdf(y, ω) * measure
         if self.around is not None:
-            far = known & is_far(dr.reinterpret_array(mi.EmitterPtr, dr.select(known, emitter, 0)))
-            E = dr.select(far, light * self._beams_pdf(x, ω), E)
+            shining = dr.reinterpret_array(mi.EmitterPtr, dr.select(known, emitter, 0))
+            far = known & is_far(shining)
+            beams = light * self._beams_pdf(x, ω)
+            if self.sky:
+                beams *= _shone_pdf(shining, ω, far)
+            E = dr.select(far, beams, E)
         return dr.select(known & (light > 0) & dr.isfinite(E), E, 0)
 
 
@@ -145,10 +155,18 @@ def is_far(emitter: mi.EmitterPtr) -> mi.Bool:
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
 
 
-def shone(emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Vector3f:
-    """The direction in which a directional light shines. Detached."""
-    ds, _ = emitter.sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), active)
+def shone(emitter: mi.EmitterPtr, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+    """The direction in which a directional light shines, or one of those of the sky, drawn by `u`. Detached."""
+    ds, _ = emitter.sample_direction(dr.zeros(mi.SurfaceInteraction3f), u, active)
     return dr.select(active, -mi.Vector3f(dr.detach(ds.d)), mi.Vector3f(0, 0, 1))
+
+
+def _shone_pdf(emitter: mi.EmitterPtr, ω: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    """Density of `shone` per solid angle, 1 of a directional light."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.d = -ω
+    delta = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+    return dr.select(delta, 1, emitter.pdf_direction(dr.zeros(mi.Interaction3f), ds, active & ~delta))
 
 
 def beam_pdf(ball: Ball, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
@@ -189,11 +207,11 @@ def light_sources(scene: mi.Scene, lights: Sequence[int], targets: Sequence[int]
     stored = tuple((varying(mi.Point3f, list(c)), varying(mi.Float, MARGIN * float(r))) for c, r in balls)
     tables = mi.UInt32([ids[k] for k in lights]), mi.UInt32(owners), mi.Float(density), mi.Float(choice)
     dr.make_opaque(*tables)
-    around = None
-    if any(mi.has_flag(emitters[k].flags(), mi.EmitterFlags.Infinite) for k in lights):
+    around, far = None, [emitters[k] for k in lights if mi.has_flag(emitters[k].flags(), mi.EmitterFlags.Infinite)]
+    if far:
         sphere = scene.bbox().bounding_sphere()
         around = varying(mi.Point3f, list(sphere.center)), varying(mi.Float, MARGIN * float(sphere.radius))
-    return LightSources(*tables, stored, around)
+    return LightSources(*tables, stored, around, any(light.is_environment() for light in far))
 
 
 def _ball(shape: mi.Shape) -> tuple[mi.ScalarPoint3f, float]:

@@ -103,8 +103,14 @@ class LightTechnique:
 
         `mis`: weight against next-event estimation alone.
         """
-        found = self._finds(k) & trail.focuses & (mis > 0) & si.is_valid()
-        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, emitter), si.p, si.n, x, found)
+        found = self._finds(k) & trail.focuses & (mis > 0)
+        y, n = si.p, si.n
+        if self.sources.sky:
+            met = si.is_valid()
+            y, n = dr.select(met, y, x - si.wi), dr.select(met, n, si.wi)
+        else:
+            found &= si.is_valid()
+        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, emitter), y, n, x, found)
         return self._shared(mis, trail.q * E)
 
     def share_next_event(

@@ -2,7 +2,8 @@
 
 What a camera path finds well costs only time to find again. Light subpaths are therefore aimed at surfaces that
 scatter in or near the mirrored or bent direction (`paths.light_technique.focuses`); a scene without any is left to
-camera paths, and so are lamps that look wide from what mirrors or bends light without scattering it.
+camera paths, and so are lamps that look wide from what mirrors or bends light without scattering it, and skies but for
+those with a sun.
 """
 
 from __future__ import annotations
@@ -20,12 +21,11 @@ from ..core.warn_once import warn_once
 from ..errors import UnsupportedWarning
 from ..options import Options
 from ..paths.light_source import light_sources
-from ..paths.light_technique import FOCUSING, SHORTEST, LightTechnique
-from ..scene.emitter_facts import EmitterFacts
+from ..paths.light_technique import FOCUSING, SHORTEST, LightTechnique, average
 from ..scene.facts import SceneFacts, ShapeFacts
 
 #: Lights that are traced. Where the others are, camera paths find them alone.
-TRACED = ("area", "point", "spot", "directional")
+TRACED = ("area", "point", "spot", "directional", "envmap", "constant")
 
 #: Light subpaths for each camera sample: of 1, 2, 4, … the one with the least variance × seconds under rough glass.
 PER_SAMPLE = 2
@@ -38,8 +38,13 @@ SPANS = 0.8
 
 #: Solid angle of a light, seen from a mirror or smooth glass [sr], from which on camera paths find what these make of
 #: it with less noise: 40 times less for a lamp of .02 sr over a ball of glass that moves, 1.6 times more for .004 sr.
-#: Rough glass and metal spread it: there light subpaths win at any size, 1.2 to 90 times.
+#: Rough glass and metal spread it: there light subpaths win at any size, 1.2 to 90 times. Not so from the sky, where
+#: smooth glass that moves never gains (30 times more variance below a sun of .004 sr), and rough surfaces gain up to 15
+#: times below that sun, but not below one of .1 sr.
 LARGE = 0.01
+
+#: Directions by which the solid angle of what shines in the sky is told.
+SKY_DIRECTIONS = 4096
 
 #: Surfaces that subpaths are aimed at one by one.
 MOST_TARGETS = 8
@@ -125,7 +130,7 @@ def plan_light(
                                    "smooth-shaded mirrors and glass the last three)"),
         (not targets, "glass and mirrors span the scene, there is nothing to aim at"),
         (not _worth_tracing(scene, facts, options, traced, targets),
-         "what mirrors and smooth glass make of lights as large as these, camera paths find with less noise"),
+         "what glass and mirrors make of lights as large as these, camera paths find with less noise"),
         (options.depth_limit <= SHORTEST, f"max_depth = {options.max_depth}: too short for light by way of a surface"),
         (facts.sensor.plugin not in KINDS.values(), f"nothing is connected to a '{facts.sensor.plugin}' sensor"),
     ):
@@ -163,20 +168,37 @@ def _worth_tracing(
     scene: mi.Scene, facts: SceneFacts, options: Options, lights: list[int], targets: list[int]
 ) -> list[int]:
     """Numbers of those of the `lights` that camera paths do not find well by way of the `targets`."""
-    scattering = set(narrow_shapes(facts)) - {s.index for s in _mirrors(facts)}
-    if options.light_paths == "only" or scattering & set(targets):
+    if options.light_paths == "only":
         return lights
+    scattering = ({*narrow_shapes(facts)} - {s.index for s in _mirrors(facts)}) & {*targets}
     shapes = scene.shapes()
     centres = [shapes[k].bbox().center() for k in targets]
 
-    def small(light: EmitterFacts) -> bool:
-        if light.delta or light.shape < 0:
+    def worth(k: int) -> bool:
+        light = facts.emitters[k]
+        if light.delta:
             return True
+        if light.shape < 0:
+            return bool(scattering) and sky_solid_angle(scene.emitters()[k]) < LARGE
         box = shapes[light.shape].bbox()
         area = math.hypot(*box.extents()) ** 2 / 2
-        return all(area < LARGE * math.dist(box.center(), centre) ** 2 for centre in centres)
+        return bool(scattering) or all(area < LARGE * math.dist(box.center(), centre) ** 2 for centre in centres)
 
-    return [k for k in lights if small(facts.emitters[k])]
+    return [k for k in lights if worth(k)]
+
+
+def sky_solid_angle(sky: mi.Emitter) -> float:
+    """The solid angle of what shines in it, (∫L)² / ∫L² [sr]: 4π of an even sky, that of the sun if nothing else does.
+
+    By the sky's own emitter sampling, with density p: ⟨L/p⟩² / ⟨L²/p⟩ over its directions. 4π of a black one.
+    """
+    number = dr.arange(mi.UInt32, SKY_DIRECTIONS)
+    u = mi.Point2f((mi.Float(number) + 0.5) / SKY_DIRECTIONS, mi.radical_inverse_2(number, 0))
+    with dr.suspend_grad():
+        ds, weight = sky.sample_direction(dr.zeros(mi.SurfaceInteraction3f, SKY_DIRECTIONS), u)
+        over_pdf = average(weight)
+        mean, squared = dr.mean(over_pdf)[0], dr.mean(dr.square(over_pdf) * ds.pdf)[0]
+    return min(4 * math.pi, mean**2 / squared) if squared > 0 else 4 * math.pi
 
 
 def _only_lights_change(facts: SceneFacts) -> bool:
