@@ -73,7 +73,8 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     Not smooth-shaded meshes: Mitsuba weighs what emitter sampling finds there by other normals than what scattering
     does, and light subpaths can agree with one of them only. Nor, beside smooth-shaded mirrors and glass, any light
     that camera paths find: delta lobes about normals that are not the surface's do not keep étendue, which the weights
-    of `paths.light_technique` take for granted.
+    of `paths.light_technique` take for granted. Nor skies that Mitsuba samples by another density than it says (those
+    with a `pose_fault`).
     """
     uneven = any(s.smooth and s.is_mesh for s in _mirrors(facts))
 
@@ -83,7 +84,7 @@ def traced_lights(facts: SceneFacts) -> list[int]:
     return [
         k
         for k, light in enumerate(facts.emitters)
-        if light.plugin in TRACED and (light.delta or not uneven)
+        if light.plugin in TRACED and not light.pose_fault and (light.delta or not uneven)
         and (light.shape < 0 or even(facts.shapes[light.shape]))
     ]
 

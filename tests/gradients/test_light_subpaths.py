@@ -218,7 +218,7 @@ def test_the_plan_says_why(llvm):
     assert make_plan(lit, "lamp.to_world", integrator={"type": "psdr_path", **QUICK}).light is None
     for scene, options, reason in (
         (load(Problem("point_shadow", "", 0.0)), {}, "nothing is focused"),
-        (load(Problem("rough_dielectric", "", 0.0)), {}, "no light is of the kinds"),
+        (load(Problem("rough_dielectric", "", 0.0)), {}, "nothing to aim at"),
         (load(Problem("glossy_floor", "", 0.0)), {}, "nothing to aim at"),
         (lit, {"max_depth": 2}, "max_depth = 2"),
     ):
