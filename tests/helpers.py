@@ -145,6 +145,17 @@ def z_scores(estimate: np.ndarray, reference: np.ndarray, weights: np.ndarray) -
     return (d - f) / np.sqrt(d_error**2 + f_error**2 + scale**2)
 
 
+def assert_image_of_path(scene: mi.Scene, spec: dict, spp: int, seeds: int, z_limit: float) -> None:
+    """The image is that of `path`, and a tenth of the light would be missed."""
+    limits = {key: spec[key] for key in ("max_depth", "rr_depth", "hide_emitters") if key in spec}
+    path, ours = images(scene, {"type": "path", **limits}, spp, seeds, 1000), images(scene, spec, spp, seeds)
+    assert np.isfinite(ours).all()
+    weights = functionals(ours.shape[1:])
+    assert np.abs(z_scores(ours, path, weights)).max() < z_limit
+    dimmer = z_scores(0.9 * ours, path, np.ones_like(weights[:1]))
+    assert np.abs(dimmer).max() > z_limit, "no power to tell a tenth of the light: raise spp"
+
+
 # ------------------------------------------------------------------------------------------ adjoint identity
 
 

@@ -14,13 +14,11 @@ import pytest
 from helpers import (
     adjoint_identity,
     assert_grad_close,
+    assert_image_of_path,
     fd,
     forward,
-    functionals,
-    images,
     kernels_compiled,
     load,
-    z_scores,
 )
 from problems import Problem
 
@@ -48,28 +46,18 @@ def bdpt(light_paths: str = "auto", **options) -> dict:
     return {"type": "psdr_bdpt", "light_paths": light_paths, **LIMITS, **options}
 
 
-def assert_image_of_path(scene: mi.Scene, spec: dict, spp: int) -> None:
-    limits = {key: spec[key] for key in ("max_depth", "rr_depth", "hide_emitters") if key in spec}
-    path, ours = images(scene, {"type": "path", **limits}, spp, SEEDS, 1000), images(scene, spec, spp, SEEDS)
-    assert np.isfinite(ours).all()
-    weights = functionals(ours.shape[1:])
-    assert np.abs(z_scores(ours, path, weights)).max() < Z_LIMIT
-    dimmer = z_scores(0.9 * ours, path, np.ones_like(weights[:1]))
-    assert np.abs(dimmer).max() > Z_LIMIT, "no power to tell a tenth of the light: raise spp"
-
-
 @pytest.mark.parametrize("options", [
     pytest.param(dict(), marks=pytest.mark.slow),
     pytest.param(dict(light_paths="only"), marks=pytest.mark.slow),
     dict(light_paths="only", hide_emitters=True, max_depth=-1, rr_depth=3),
 ], ids=["auto", "only", "only-roulette-hidden"])  # fmt: skip
 def test_image(variant, options):
-    assert_image_of_path(load(GLASS, res=16), bdpt(**options), 128)
+    assert_image_of_path(load(GLASS, res=16), bdpt(**options), 128, SEEDS, Z_LIMIT)
 
 
 @pytest.mark.slow
 def test_image_with_a_smooth_filter(variant):
-    assert_image_of_path(load(GLASS, res=16, rfilter="gaussian"), bdpt("only"), 128)
+    assert_image_of_path(load(GLASS, res=16, rfilter="gaussian"), bdpt("only"), 128, SEEDS, Z_LIMIT)
 
 
 SENSORS = {
@@ -116,7 +104,7 @@ def glass_scene(alpha: float = 0.2, sensor: str = "perspective", light: str = "s
     dict(glass="slab"), dict(glass="mirror"), dict(alpha=0.1),
 ], ids=lambda scene: "-".join(map(str, scene.values())))  # fmt: skip
 def test_image_of(llvm, scene):
-    assert_image_of_path(glass_scene(**scene), bdpt("only"), 512)
+    assert_image_of_path(glass_scene(**scene), bdpt("only"), 512, SEEDS, Z_LIMIT)
 
 
 @pytest.mark.parametrize("name", [
