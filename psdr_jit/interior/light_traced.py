@@ -33,7 +33,7 @@ from ..core.varying import varying
 from ..paths.bounce import PathLimits
 from ..paths.delta_step import delta_step
 from ..paths.edge_on import GRAZING, first_cosine, met_edge_on
-from ..paths.light_source import LightStart
+from ..paths.light_source import LightStart, is_far
 from ..paths.light_technique import average
 from ..paths.light_vertices import LightVertices
 from ..paths.light_walk import LightPath, trace_light
@@ -210,12 +210,11 @@ def _emitter_sample(
     scene: mi.Scene, start: LightStart, si: mi.SurfaceInteraction3f, x: mi.Point3f, factor: mi.Float, active: mi.Bool
 ) -> tuple[EmitterSample, Hit, mi.Bool]:
     """The light as the emitter sample of `si` (at x), worth `factor`; nowhere else than in `active` lanes."""
-    offset = start.y - x
     ds = dr.zeros(mi.DirectionSample3f)
-    ds.p, ds.dist = start.y, dr.norm(offset)
-    ds.d = mi.Vector3f(offset / ds.dist)
+    ds.p, ds.dist, ds.d = start.y, dr.norm(start.y - x), -start.ray.d
     ds.emitter = dr.reinterpret_array(mi.EmitterPtr, start.emitter)
     hit, seen = shadow_hit(scene, si, ds, active)
+    hit.d = dr.select(is_far(ds.emitter), ds.d, hit.d)
     sample = EmitterSample(
         emitter=dr.select(seen, start.emitter, 0),
         shape=dr.select(active, hit.shape, 0),

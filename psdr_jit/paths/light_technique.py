@@ -104,13 +104,13 @@ class LightTechnique:
         `mis`: weight against next-event estimation alone.
         """
         found = self._finds(k) & trail.focuses & (mis > 0)
-        y, n = si.p, si.n
+        y, n, ω = si.p, si.n, si.to_world(si.wi)
         if self.sources.sky:
             met = si.is_valid()
-            y, n = dr.select(met, y, x - si.wi), dr.select(met, n, si.wi)
+            y, n, ω = (dr.select(met, *of) for of in ((y, x), (n, si.wi), (ω, si.wi)))
         else:
             found &= si.is_valid()
-        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, emitter), y, n, x, found)
+        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, emitter), y, n, ω, x, found)
         return self._shared(mis, trail.q * E)
 
     def share_next_event(
@@ -119,7 +119,7 @@ class LightTechnique:
         """Weight of the emitter sample `ds` in the local direction `ω` at `si`, the vertex number `k`."""
         found = active & self._finds(k + 1) & focuses(bsdf) & (ds.pdf > 0)
         n = dr.select(ds.delta, 0, ds.n)
-        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, ds.emitter), ds.p, n, si.p, found)
+        E = self.sources.segment_density(dr.reinterpret_array(mi.UInt32, ds.emitter), ds.p, n, -ds.d, si.p, found)
         found &= E > 0
         h = reverse_pdf(mi.BSDFContext(), si, bsdf, ω, self.mixture, found) * cosine_ratio(si, ω)
         return self._shared(mis, dr.select(found, trail.q * h / ds.pdf * E, 0))

@@ -125,15 +125,14 @@ def _first_segment(
     si = interaction(pi, start.ray, limits)
     emitter = dr.reinterpret_array(mi.EmitterPtr, start.emitter)
     valid = pi.is_valid()
-    E = technique.sources.segment_density(start.emitter, start.y, start.n, si.p, valid)
+    E = technique.sources.segment_density(start.emitter, start.y, start.n, start.ray.d, si.p, valid)
     of_delta, irradiance = emitter.sample_direction(si, mi.Point2f(0.5), valid & start.delta)
     value = dr.select(start.delta, irradiance, start.radiance)
 
     ds = mi.DirectionSample3f(of_delta)
     ds.p, ds.n, ds.emitter = start.y, start.n, emitter
-    offset = start.y - si.p
-    ds.dist = dr.norm(offset)
-    ds.d = mi.Vector3f(offset / ds.dist)
+    ds.dist = dr.norm(start.y - si.p)
+    ds.d = -start.ray.d
     pdf = scene.pdf_emitter_direction(si, ds, valid & ~start.delta)
     pdf = dr.select(start.delta, dr.gather(mi.Float, technique.sources.choice, start.emitter, valid), pdf)
     return _Carried.of(dr.select(valid & si.is_valid(), value, 0), E), pdf

@@ -25,7 +25,7 @@ from ..paths.light_technique import FOCUSING, SHORTEST, LightTechnique, average
 from ..scene.facts import SceneFacts, ShapeFacts
 
 #: Lights that are traced. Where the others are, camera paths find them alone.
-TRACED = ("area", "envmap", "constant", "point", "spot", "directional")
+TRACED = ("area", "envmap", "constant", "sunsky", "point", "spot", "directional")
 
 #: Light subpaths for each camera sample: of 1, 2, 4, … the one with the least variance × seconds under rough glass.
 PER_SAMPLE = 2

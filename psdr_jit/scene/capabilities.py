@@ -141,7 +141,8 @@ SUPPORT = (
         "where they stand on others or are spheres that cut into them; maps whose pose does more than to turn them"),
     Row("point, spot, directional light", "yes", "a rim that is hard but for a thousandth of the cone: warning"),
     Row("projector", "yes", "its frame, and checkerboards and nearest-neighbour bitmaps as its picture, are edges"),
-    Row("sunsky", "warning", "while the camera or the sky turns; the rim of the sun disc is not sampled"),
+    Row("sunsky", "warning",
+        "while the camera or the sky turns: the rim of the sun disc is not sampled; poses that do more than turn it"),
     Row("rough and diffuse materials", "yes", ""),
     Row("mirrors, smooth glass and plastic, null, mask", "yes",
         _MOVING + "beside SDF grids that instances show: error; seen in them, frames of projectors and "

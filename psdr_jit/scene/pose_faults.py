@@ -61,8 +61,8 @@ def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
 
 
 def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
-    """The same of an environment map."""
-    if plugin != "envmap":
+    """The same of an environment map, or of a sky with a sun."""
+    if plugin not in ("envmap", "sunsky", "timed_sunsky"):
         return ""
     matrix = _pose_of(graph, emitter)
     if matrix is None:
@@ -73,8 +73,8 @@ def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
     if np.abs(axes.T @ axes - np.eye(3)).max() <= UNEVEN_SCALE:
         return ""
     return (
-        "has a to_world that does more than turn it, so that Mitsuba looks texels up by directions that are not of "
-        "length 1: the derivative is by other texels; scale nothing, and give rotations axes of length 1"
+        "has a to_world that does more than turn it, so that Mitsuba looks it up, or draws it, by directions that are "
+        "not of length 1: image and derivative are off; scale nothing, and give rotations axes of length 1"
     )
 
 

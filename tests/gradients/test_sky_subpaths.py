@@ -24,6 +24,7 @@ BODIES = {
 }
 ROWS = 128  # of the map
 SUN, HAZE = 0.01, 0.6  # widths of what shines [rad]
+SUN_AT = [0.35, 0.3, 0.9]  # z upwards
 Z_LIMIT = 4.5
 TOLERANCE = 1e-5  # of the adjoint identity
 SEEDS = 16
@@ -57,10 +58,19 @@ def only(**options) -> dict:
     return {"type": "psdr_bdpt", "light_paths": "only", **LIMITS, **options}
 
 
-@pytest.mark.parametrize("body, light", [("glass", "sun"), ("metal", "sun"), ("smooth", "sun"), ("glass", "even")])
+def sunsky() -> dict:
+    """A sun with a hard rim."""
+    return {"type": "sunsky", "sun_direction": SUN_AT, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)}
+
+
+LIGHTS = {"sun": lambda: sky(0.1), "even": lambda: {"type": "constant"}, "sunsky": sunsky}
+
+
+@pytest.mark.parametrize("body, light", [
+    ("glass", "sun"), ("metal", "sun"), ("smooth", "sun"), ("glass", "even"), ("glass", "sunsky"),
+])  # fmt: skip
 def test_image_is_that_of_path(llvm, body, light):
-    scene = scene_of(body, sky(0.1) if light == "sun" else {"type": "constant"})
-    assert_image_of_path(scene, only(), 64, SEEDS, Z_LIMIT)
+    assert_image_of_path(scene_of(body, LIGHTS[light]()), only(), 64, SEEDS, Z_LIMIT)
 
 
 TURNED = "sky.to_world", {"rotate": (0.6, 0, 0.8)}
@@ -90,7 +100,7 @@ def test_skies_are_traced_where_a_sun_shines_on_what_is_rough(llvm):
         spec = {"type": "psdr_bdpt", **LIMITS, "form": "spatial", "sppc": 1, "sppp": 0, "sppi": 0}
         return make_plan(scene_of(body, light), "floor.to_world", integrator=spec).light
 
-    assert light_of("glass", sky(SUN)).runs and light_of("metal", sky(SUN)).runs
+    assert light_of("glass", sky(SUN)).runs and light_of("metal", sky(SUN)).runs and light_of("glass", sunsky()).runs
     assert not light_of("smooth", sky(SUN)).runs
     assert not light_of("glass", sky(HAZE)).runs
     assert "as large as these" in light_of("glass", {"type": "constant"}).reason

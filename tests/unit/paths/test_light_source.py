@@ -40,7 +40,8 @@ def test_density_is_that_of_the_samples(llvm, lamp, radius):
     _, traced = sources(LAMPS[lamp](), radius)
     start = traced.sample(lane_sampler(mi.UInt32(1), dr.arange(mi.UInt32, LANES)), [])
     x = start.ray.o + start.ray.d
-    E = np.array(traced.segment_density(start.emitter, start.y, start.n, x, mi.Bool(True)), dtype=np.float64)
+    E = traced.segment_density(start.emitter, start.y, start.n, start.ray.d, x, mi.Bool(True))
+    E = np.array(E, dtype=np.float64)
     assert (E > 0).mean() > 0.95  # directions at a cone's rim may round to its outside
     to_pdf = 1.0 if lamp == "point" else AREA * np.abs(np.array(dr.dot(start.n, start.ray.d), dtype=np.float64))
     inverse = (1 / (E * to_pdf)[E > 0]).mean()
@@ -52,7 +53,7 @@ def test_density_is_that_of_the_samples(llvm, lamp, radius):
     ω = mi.Vector3f((ω / np.linalg.norm(ω, axis=0)).astype(np.float32))
     y, n, emitter = (dr.gather(type(v), v, dr.arange(mi.UInt32, EVERYWHERE) % LANES)
                      for v in (start.y, start.n, start.emitter))  # fmt: skip
-    E = np.array(traced.segment_density(emitter, y, n, mi.Point3f(y) + ω, mi.Bool(True)), dtype=np.float64)
+    E = np.array(traced.segment_density(emitter, y, n, ω, mi.Point3f(y) + ω, mi.Bool(True)), dtype=np.float64)
     to_pdf = 1.0 if lamp == "point" else AREA * np.abs(np.array(dr.dot(n, ω), dtype=np.float64))
     assert np.isclose(inverse, (E > 0).mean() * 4 * np.pi, rtol=0.05)
     assert np.isclose((E * to_pdf).mean() * 4 * np.pi, 1, rtol=0.05)
@@ -60,8 +61,9 @@ def test_density_is_that_of_the_samples(llvm, lamp, radius):
 
 def test_other_lights_have_none(llvm):
     scene, traced = sources(area_light())
-    nothing = traced.segment_density(mi.UInt32(0), mi.Point3f(0), mi.Normal3f(0), mi.Point3f(1), mi.Bool(True))
-    unknown = traced.segment_density(mi.UInt32(99), mi.Point3f(0), mi.Normal3f(0), mi.Point3f(1), mi.Bool(True))
+    segment = mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0, 0, 1), mi.Point3f(0, 0, 1)
+    nothing = traced.segment_density(mi.UInt32(0), *segment, mi.Bool(True))
+    unknown = traced.segment_density(mi.UInt32(99), *segment, mi.Bool(True))
     assert nothing[0] == 0 and unknown[0] == 0
 
 

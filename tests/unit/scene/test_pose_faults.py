@@ -36,16 +36,23 @@ def test_mirrored_shapes_that_move(plugin, scale, name, told):
     assert ((SceneError, "x") in complaints(name, x=shape)) == told
 
 
+SKIES = {
+    "envmap": lambda: {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))},
+    "sunsky": lambda: {"type": "sunsky"},
+}
+
+
+@pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize(("pose", "told"), [
     (("rotate", [1, 1, 0], 50), True), (("scale", 2), True), (("rotate", [0, 0.6, 0.8], 50), False),
     (("scale", [-1, 1, 1]), False),
 ])  # fmt: skip
-def test_skies_that_are_more_than_turned(pose, told):
+def test_skies_that_are_more_than_turned(sky, pose, told):
     """An axis of rotation that is not of length 1 is what people write: Mitsuba makes a shear of it."""
     how, *arguments = pose
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32)),
-           "to_world": getattr(mi.ScalarTransform4f(), how)(*arguments)}  # fmt: skip
-    found = complaints("env.scale", env=sky, floor={"type": "rectangle"})
+    turned = SKIES[sky]() | {"to_world": getattr(mi.ScalarTransform4f(), how)(*arguments)}
+    floor = {"type": "rectangle", "bsdf": {"type": "diffuse"}}
+    found = complaints("floor.bsdf.reflectance.value", env=turned, floor=floor)
     assert ((UnsupportedWarning, "env") in found) == told
 
 
