@@ -11,7 +11,7 @@ from variants import also
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.derivative.statistics import block_means
 
-SPP, SEEDS = 64, 24
+SPP, SEEDS = 64, 12
 
 
 def joint(overlap: float) -> mi.Scene:
