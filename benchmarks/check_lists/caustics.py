@@ -17,6 +17,7 @@ DOWN = {"origin": list(AT), "target": list(CENTRE), "up": [0.2, 0.1, 1]}
 UP = (0.1, 1.0, 0.05)
 ALPHAS = (0.05, 0.1, 0.2)
 STEP, STEP_OF_BODY = 0.01, 0.004  # a tenth of a pixel, but for what has outlines of its own
+STEP_OF_SMOOTH = 0.002  # of the index of smooth glass: its caustic ends within a fraction of a pixel
 
 
 def light(kind: str) -> dict:
@@ -42,9 +43,10 @@ def scene(kind: str, bsdf: dict, lit: str) -> mi.Scene:
     return scene_of(5, camera, METHOD, **parts)
 
 
-def motions(kind: str, lit: str, index: bool) -> Iterator[tuple[str, Motion]]:
-    if index:
-        yield "index", Motion("body.bsdf.eta", STEP, 1.0)
+def motions(kind: str, lit: str, of_index: float | None) -> Iterator[tuple[str, Motion]]:
+    """`of_index`: step of the refractive index; None: there is none."""
+    if of_index is not None:
+        yield "index", Motion("body.bsdf.eta", of_index, 1.0)
     yield "light moved", moved("lamp.position" if lit == "point" else "lamp.to_world", ALONG, STEP)
     yield "body moved", moved("body.to_world" if kind == "ball" else "body.vertex_positions", ALONG, STEP_OF_BODY)
     yield "floor lifted", moved("floor.to_world", UP, STEP)
@@ -54,13 +56,15 @@ def caustics() -> Iterator[Listed]:
     for kind in ("slab", "ball"):
         for alpha in ALPHAS:
             glass = {"type": "roughdielectric", "alpha": alpha, "distribution": "ggx", "int_ior": 1.5}
-            yield from _cases(f"rough glass {kind} {alpha}", kind, glass, ("area", "spot"), True)
+            yield from _cases(f"rough glass {kind} {alpha}", kind, glass, ("area", "spot"), STEP)
     lights = ("area", "spot", "point")
-    yield from _cases("smooth glass ball", "ball", {"type": "psdr_dielectric", "int_ior": 1.5}, lights, True)
-    yield from _cases("mirror ball", "ball", {"type": "conductor"}, lights, False)
+    yield from _cases("smooth glass ball", "ball", {"type": "psdr_dielectric", "int_ior": 1.5}, lights, STEP_OF_SMOOTH)
+    yield from _cases("mirror ball", "ball", {"type": "conductor"}, lights, None)
 
 
-def _cases(name: str, kind: str, bsdf: dict[str, Any], lights: tuple[str, ...], index: bool) -> Iterator[Listed]:
+def _cases(
+    name: str, kind: str, bsdf: dict[str, Any], lights: tuple[str, ...], of_index: float | None
+) -> Iterator[Listed]:
     for lit in lights:
-        for what, motion in motions(kind, lit, index):
+        for what, motion in motions(kind, lit, of_index):
             yield Listed(NAME, f"{name}, {lit}, {what}", partial(scene, kind, bsdf, lit), motion, method=METHOD)
