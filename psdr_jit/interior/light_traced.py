@@ -32,7 +32,7 @@ from ..core.streams import Stream, stream_seed
 from ..core.varying import varying
 from ..paths.bounce import PathLimits
 from ..paths.delta_step import delta_step
-from ..paths.edge_on import GRAZING, first_cosine, met_edge_on
+from ..paths.edge_on import GRAZING, GRAZING_FLAT, first_cosine, met_edge_on
 from ..paths.light_source import LightStart, is_far
 from ..paths.light_technique import average
 from ..paths.light_vertices import LightVertices
@@ -162,6 +162,8 @@ def turn_around(
         ω = dr.select(last, hit_light.d, ω)
         F = _factor(si, ω, delta, limits, active & (~last | delta))
         sound &= last | delta | _differentiable(si, ω, limits)
+        # the light meets this vertex along −ω; at the outline of a ball it does so as often as its rays pass there
+        sound &= delta | ~met_edge_on(si, ω, GRAZING_FLAT)
         p = average(F)
         p = dr.select(last & ~delta, 0, dr.select(p > 0, p, 1))
         vertex = Vertex(hit, β, mi.Float(0), light, Continuation(p, mi.Float(1), mi.Bool(delta)))
