@@ -77,15 +77,15 @@ def test_image_is_that_of_path(llvm, body, light):
 TURNED = "sky.to_world", {"rotate": (0.6, 0, 0.8)}
 
 
-@pytest.mark.parametrize("body, param, way", [
-    ("metal", *TURNED),
-    pytest.param("glass", *TURNED, marks=pytest.mark.slow),
-    pytest.param("metal", "body.bsdf.alpha.value", {"direction": 1.0}, marks=pytest.mark.slow),
+@pytest.mark.parametrize("body, param, way, spp", [
+    ("metal", *TURNED, 256),
+    pytest.param("glass", *TURNED, 1024, marks=pytest.mark.slow),
+    pytest.param("metal", "body.bsdf.alpha.value", {"direction": 1.0}, 1024, marks=pytest.mark.slow),
 ], ids=["metal-turned", "glass-turned", "metal-roughness"])  # fmt: skip
-def test_derivative_is_that_of_camera_paths(llvm, body, param, way):
+def test_derivative_is_that_of_camera_paths(llvm, body, param, way, spp):
     moved = perturb(scene_of(body, sky(0.1)), param, **way)
-    ours = forward(moved, only(**INTERIOR), SEEDS, 256)
-    theirs = forward(moved, {"type": "psdr_path", **LIMITS, **INTERIOR}, SEEDS, 512)
+    ours = forward(moved, only(**INTERIOR), SEEDS, spp)
+    theirs = forward(moved, {"type": "psdr_path", **LIMITS, **INTERIOR}, SEEDS, 2 * spp)
     assert_grad_close(ours, theirs)
 
 
