@@ -135,7 +135,8 @@ def turn_around(
 ) -> mi.Bool:
     """Write the paths into `records` in the order in which the camera meets them. Detached.
 
-    Returns the lanes that have a derivative: no vertex is met edge-on (`met_edge_on`), and the light is where it was.
+    Returns the lanes that have a derivative: no vertex is met edge-on (`met_edge_on`), by what comes from the sensor or
+    from the light, and the light is where it was.
     """
     n = mi.UInt32(path.count)
     here = subpath.vertex(n - 1, n > 0)
