@@ -28,8 +28,8 @@ from ..scene.facts import SceneFacts, ShapeFacts
 TRACED = ("area", "envmap", "constant", "sunsky", "point", "spot", "directional")
 
 #: Light subpaths for each camera sample: of images and of what materials change, and where something moves. There 4 of
-#: them bring variance × time to .72 of that with 2 (geometric mean of 20 cases of rough glass and metal, .33 to 1.2),
-#: and 8 no further; while an index changes 4 are as good as 2 (.75 to 1.2).
+#: them bring variance × time to .74 of that with 2 (geometric mean of 19 cases of glass and metal, .33 to 1.2), and 8
+#: to .71 (.15 to 1.6); while an index changes 4 are as good as 2 (four cases, .75 to 1.2).
 PER_SAMPLE, WHERE_THINGS_MOVE = 2, 4
 
 #: Surface vertices of a light subpath, at most; longer paths are left to the camera's.

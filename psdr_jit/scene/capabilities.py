@@ -109,6 +109,9 @@ POSE_PARAMETERS = frozenset({
 CONE_PARAMETERS = frozenset({"cutoff_angle", "beam_width"})
 """Of a spot: they move the steps of its light, if it has any."""
 
+SUN_SKIES = frozenset({"sunsky", "timed_sunsky"})
+"""Skies with a sun, whose disc has a hard rim."""
+
 
 class Row(NamedTuple):
     feature: str

@@ -14,7 +14,7 @@ from ..core.compat import VERTEX_TEXCOORDS
 from ..core.memory import Memory
 from ..core.warn_once import warn_once
 from ..errors import PsdrError, SceneError, UnsupportedError, UnsupportedWarning, ZeroDerivativeWarning
-from .capabilities import CONE_PARAMETERS, COPIES, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
+from .capabilities import CONE_PARAMETERS, COPIES, SUN_SKIES, SUPPORTED_SENSORS, UNSUPPORTED_SHAPES
 from .facts import SceneFacts, ShapeFacts
 from .size import overflow, too_low_for_shadows
 
@@ -245,7 +245,7 @@ def check_emitters(facts: SceneFacts) -> Iterator[Finding]:
                 f"{label} has a rim so thin that few samples meet it: its part of the derivative is mostly noise; set "
                 "beam_width equal to cutoff_angle, which is a step that is sampled, or well below it",
             )  # fmt: skip
-        if emitter.plugin in ("sunsky", "timed_sunsky") and (facts.camera_moves or emitter.pose):
+        if emitter.plugin in SUN_SKIES and (facts.camera_moves or emitter.pose):
             yield Finding(
                 UnsupportedWarning, emitter.name,
                 f"{label} has a sun disc whose rim is not sampled: it is missing where the disc is seen by "

@@ -7,7 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from .capabilities import GRID_SHAPES
+from .capabilities import GRID_SHAPES, SUN_SKIES
 from .graph import SceneGraph, on_host_or_none
 
 #: Relative difference of axis lengths (and cosine between axes) up to which a transform counts as uniform.
@@ -62,7 +62,7 @@ def shape_pose_fault(graph: SceneGraph, shape: mi.Shape, plugin: str) -> str:
 
 def sky_pose_fault(graph: SceneGraph, emitter: mi.Emitter, plugin: str) -> str:
     """The same of an environment map, or of a sky with a sun."""
-    if plugin not in ("envmap", "sunsky", "timed_sunsky"):
+    if plugin not in ("envmap", *SUN_SKIES):
         return ""
     matrix = _pose_of(graph, emitter)
     if matrix is None:

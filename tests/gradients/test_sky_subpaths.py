@@ -79,8 +79,8 @@ TURNED = "sky.to_world", {"rotate": (0.6, 0, 0.8)}
 
 @pytest.mark.parametrize("body, param, way, spp", [
     ("metal", *TURNED, 256),
-    pytest.param("glass", *TURNED, 1024, marks=pytest.mark.slow),
-    pytest.param("metal", "body.bsdf.alpha.value", {"direction": 1.0}, 1024, marks=pytest.mark.slow),
+    also("glass", *TURNED, 1024),
+    also("metal", "body.bsdf.alpha.value", {"direction": 1.0}, 1024),
 ], ids=["metal-turned", "glass-turned", "metal-roughness"])  # fmt: skip
 def test_derivative_is_that_of_camera_paths(llvm, body, param, way, spp):
     moved = perturb(scene_of(body, sky(0.1)), param, **way)

@@ -70,8 +70,8 @@ def test_rotations_about_long_axes(plugin, axis, told):
 @pytest.mark.parametrize(("name", "category"), [("ball.to_world", SceneError), ("sky.to_world", UnsupportedWarning)])
 def test_several_poses_are_named(name, category):
     """As variables that are wider than one make them."""
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
-    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sky": sky, "camera": {"type": "perspective"}})
+    bodies = {"ball": {"type": "sphere"}, "sky": SKIES["envmap"](), "camera": {"type": "perspective"}}
+    scene = mi.load_dict({"type": "scene", **bodies})
     params, x = mi.traverse(scene), dr.linspace(mi.Float, 0, 1, 5)
     dr.enable_grad(x)
     params[name] = mi.Transform4f().translate(mi.Vector3f(x, 0, 0))
