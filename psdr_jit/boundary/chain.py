@@ -200,7 +200,7 @@ def forward(job: Job) -> mi.TensorXf:
             F_grad = slope_at_end(job.facts, chain, steps.end, camera, job.motion)
             image += share * _splat(job, steps, job.call.counters.rejected.keep_finite(steps.value * F_grad))
         if job.light is not None:
-            image += light_chain.forward(job)
+            image += light_chain.forward(job.with_film_at_rest())
     return image
 
 
@@ -228,7 +228,7 @@ def backward(job: Job, grad_in: mi.TensorXf) -> None:
                     accumulate(dr.dot(λ_o, start) + dr.dot(λ_d, direction))
             dr.eval()
         if job.light is not None:
-            light_chain.backward(job, grad_in)
+            light_chain.backward(job.with_film_at_rest(), grad_in)
 
 
 def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:

@@ -5,29 +5,35 @@
 over the n samples p_i of the interior term, uniform in their pixels, whose radiance f_i its sweeps know. It is the
 derivative of Σ f_i h(p_i + θ w) (1 + θ div w), which is how it is computed, so that both modes share it. What the film
 divides by is a constant here, the mass of the filter (`films.develop_boundary`). A box filter has a slope at borders of
-pixels alone, which is `film_borders`.
+pixels alone, which is `film_borders`. Paths that light subpaths find (`light_traced`) are splatted where they land.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
 from ..core.ad import backpropagate, tangents
+from ..core.camera_rays import RayPerPixel
 from ..core.varying import varying
 from ..paths.recording import PathRecords
 from ..plan.job import Job
 from .camera_pass import CameraPass
 
 
-def turned(job: Job, p: CameraPass) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Displacements `(of the origin, of the direction)` of a pass's camera rays as their places move, attached."""
-    shift, _ = job.film_flow.at(p.p)
-    return p.per_px.moved(shift)
+def turned(job: Job, p: mi.Point2f, per_px: RayPerPixel) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Displacements `(of the origin, of the direction)` of the camera rays of the places `p` as these move, attached.
+
+    `per_px`: of these rays.
+    """
+    shift, _ = job.film_flow.at(p)
+    return per_px.moved(shift)
 
 
-def _image(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.TensorXf:
+def of_samples(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.TensorXf:
     """Image of the radiance `L` of the paths of a pass, attached to where they are on the film."""
     shift, div = job.film_flow.at(p.p)
     share = p.at.weight * (1 + div) / varying(mi.Float, p.samples.spp)
@@ -38,13 +44,19 @@ def _image(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.
     )
 
 
-def forward(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.TensorXf:
-    """Derivative image. Detached."""
+def of_splats(job: Job, p: mi.Point2f, value: mi.Spectrum, wavelengths, active: mi.Bool) -> mi.TensorXf:
+    """Image of values that are splatted at `p` [px], attached to where that is."""
+    shift, div = job.film_flow.at(p)
+    return films.develop_boundary(job.film, p + shift, value * (1 + div), mi.Float(0), wavelengths, active)
+
+
+def forward(job: Job, image: Callable[..., mi.TensorXf], *of) -> mi.TensorXf:
+    """Derivative of the `image` of what is given. Detached."""
     with dr.resume_grad(job.film_flow.nodes):
-        return tangents(_image(job, p, records, L))
+        return tangents(image(job, *of))
 
 
-def backward(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum, grad_in: mi.TensorXf) -> None:
+def backward(job: Job, grad_in: mi.TensorXf, image: Callable[..., mi.TensorXf], *of) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the flow."""
     with dr.resume_grad(job.film_flow.nodes):
-        backpropagate(_image(job, p, records, L), grad_in)
+        backpropagate(image(job, *of), grad_in)

@@ -177,7 +177,7 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
         return p.develop(job.film, dL)
     L = keep_finite(L)
     dr.eval(dL, L)
-    return p.develop(job.film, dL) + film_places.forward(job, known, records, L)
+    return p.develop(job.film, dL) + film_places.forward(job, film_places.of_samples, known, records, L)
 
 
 def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -186,7 +186,7 @@ def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi
     if job.film_flow is None:
         return o_grad, d_grad
     with dr.resume_grad(job.film_flow.nodes):
-        o, d = tangents(*film_places.turned(job, p))
+        o, d = tangents(*film_places.turned(job, p.p, p.per_px))
     return o_grad + o, d_grad + d
 
 
@@ -240,11 +240,12 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
         with dr.resume_grad():
             adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
             if job.film_flow is not None:
-                o, d = film_places.turned(job, p)
+                o, d = film_places.turned(job, p.p, p.per_px)
                 adjoint += dr.dot(o, λ_o) + dr.dot(d, λ_d)
             accumulate(adjoint)  # other terms need the sensor's edges
     if job.film_flow is not None:
-        film_places.backward(job, p, records, job.call.counters.rejected.keep_finite(L), share * grad_in)
+        L = job.call.counters.rejected.keep_finite(L)
+        film_places.backward(job, share * grad_in, film_places.of_samples, p, records, L)
     dr.eval()
 
 

@@ -72,8 +72,8 @@ def why_film_rests(call: Call, facts: SceneFacts, light: LightPlan | None) -> st
         return "camera and shapes rest, and so do places on the film"
     if call.sensor.class_name() not in KINDS:
         return f"places on the film of a '{call.sensor.class_name()}' are not followed"
-    if light is not None and light.runs:
-        return "light subpaths end at places on the film that rest"
+    if light is not None and light.runs and call.film.rfilter().is_box_filter():
+        return "light subpaths do not end on borders of pixels"
     return ""
 
 

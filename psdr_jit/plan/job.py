@@ -109,6 +109,10 @@ class Job:
         """Where places on the film go, if they do."""
         return self.motion.flow if isinstance(self.motion, FilmMotion) else None
 
+    def with_film_at_rest(self) -> Job:
+        """The same for what does not begin at places on the film, and so does not know where they go."""
+        return replace(self, motion=self.motion.base) if isinstance(self.motion, FilmMotion) else self
+
     @property
     def learns(self) -> bool:
         """Do samples of this job tell about the scene's own motion, and not about a probe's?"""

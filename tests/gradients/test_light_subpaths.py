@@ -69,10 +69,12 @@ SENSORS = {
 }
 
 
-def glass_scene(alpha: float = 0.2, sensor: str = "perspective", light: str = "spot", glass: str = "ball") -> mi.Scene:
+def glass_scene(
+    alpha: float = 0.2, sensor: str = "perspective", light: str = "spot", glass: str = "ball", rfilter: str = "box"
+) -> mi.Scene:
     """Rough glass, or a rough mirror, between a floor and a small light."""
     T = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": rfilter}, "pixel_format": "luminance"}
     pose = T().look_at(origin=[0.5, 2.2, 3.2], target=[0, -0.7, 0], up=[0, 1, 0])
     if sensor == "orthographic":
         pose = pose @ T().scale([1.3, 1.3, 1])
@@ -166,16 +168,39 @@ def test_same_flow_however_found(llvm, form):
     assert_grad_close(by_light, by_camera, max_stderr=0.06)
 
 
+def assert_transposes(scene: mi.Scene, param: str, form: str) -> None:
+    integrator = integrator_specs.build(bdpt(form=form))
+    wJv, JTwv, w, Jv = adjoint_identity(scene, param, integrator)
+    assert integrator.plan.form == form and Jv > 1e-6
+    assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
+
+
 @pytest.mark.parametrize("param", [
     pytest.param("lamp.to_world", marks=SLOW), "ball.bsdf.eta", pytest.param("ball.to_world", marks=SLOW),
     pytest.param("camera.to_world", marks=SLOW),
 ])  # fmt: skip
 def test_forward_and_backward_are_transposes(variant, param):
     for form in ("spatial",) if param.endswith("eta") else ("spatial", "material"):
-        integrator = integrator_specs.build(bdpt(form=form))
-        wJv, JTwv, w, Jv = adjoint_identity(load(GLASS, res=16), param, integrator)
-        assert Jv > 1e-6
-        assert abs(wJv - JTwv) <= TOLERANCE * w * Jv, f"forward {wJv:.8g}, backward {JTwv:.8g}, bound on {w * Jv:.3g}"
+        assert_transposes(load(GLASS, res=16), param, form)
+
+
+@pytest.mark.parametrize("param, form", [
+    ("body.to_world", "film"), pytest.param("camera.to_world", "film-material", marks=SLOW)
+])  # fmt: skip
+def test_both_modes_know_where_places_on_the_film_go(llvm, param, form):
+    assert_transposes(glass_scene(rfilter="gaussian"), param, form)
+
+
+@pytest.mark.parametrize("param", ["camera.to_world", pytest.param("body.to_world", marks=SLOW)])
+def test_what_the_light_finds_moves_over_the_film(llvm, param):
+    """Where places on the film follow, by light subpaths alone; without splats that move the gain would be .28, .67."""
+    motion = perturb(glass_scene(alpha=0.5, light="area", rfilter="gaussian"), param, X)
+    budgets = {"max_depth": 4, "sppc": 1, "sppp": 1, "sppi": 1}
+    film, rests = (
+        forward(motion, bdpt(how, form=form, **budgets), SEEDS, 96)
+        for how, form in (("only", "film"), ("off", "spatial"))
+    )
+    assert_grad_close(film, rests, max_stderr=0.05)
 
 
 @pytest.mark.slow

@@ -27,10 +27,10 @@ HEIGHT = 2.5  # of the lamp above the ball [m]
 SMALL, WIDE = 0.9 * np.sqrt(LARGE) * HEIGHT, 2 * np.sqrt(LARGE) * HEIGHT  # sides of the lamp [m]
 
 
-def scene_of(body: str, side: float, lamp: str = "rectangle") -> mi.Scene:
+def scene_of(body: str, side: float, lamp: str = "rectangle", rfilter: str = "gaussian") -> mi.Scene:
     """A ball on a floor, below a lamp."""
     T = mi.ScalarTransform4f
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "gaussian"}}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": rfilter}}
     view = T().look_at(origin=[0.3, -3.5, 2.2], target=[0, 0, 0.3], up=[0, 0, 1])
     flat = [side / 2, side / 2, 1 if lamp == "rectangle" else 1e-3]
     return mi.load_dict({
@@ -64,11 +64,13 @@ def test_vertex_normals_of_flat_faces_do_not_keep_a_lamp_from_being_traced(llvm)
     assert plan_of(scene_of("rough", SMALL, "cube")).light.runs
 
 
-def test_places_on_the_film_follow_where_no_light_is_traced(llvm):
+def test_places_on_the_film_follow_but_under_a_box_filter_if_light_is_traced(llvm):
     form = {"form": "film", "sppp": 1, "sppi": 1}
     assert plan_of(scene_of("smooth", WIDE), **form).form == "film"
-    traced = plan_of(scene_of("smooth", SMALL), **form)
-    assert traced.form == "spatial" and "light subpaths" in traced.form_reason
+    assert plan_of(scene_of("smooth", SMALL), **form).form == "film"
+    for lamp, kept in ((WIDE, "film"), (SMALL, "spatial")):
+        found = plan_of(scene_of("smooth", lamp, rfilter="box"), **form)
+        assert found.form == kept and ("light subpaths" in found.form_reason) == (kept == "spatial")
 
 
 def job_of(scene: mi.Scene) -> Job:
