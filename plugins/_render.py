@@ -10,6 +10,7 @@ from mitsuba.ad.integrators.common import ADIntegrator
 
 from psdr_jit.core import film as films
 from psdr_jit.core.ad import leftovers_named
+from psdr_jit.core.collection import nothing_collected
 from psdr_jit.core.counters import Counters
 from psdr_jit.core.memory import Memory
 from psdr_jit.core.spilling import spill_to_local_memory
@@ -63,17 +64,18 @@ class TermIntegrator(ADIntegrator):
             return self.aovs.beside(self.primal(scene, view, seed, spp, develop, evaluate), scene, view, seed, spp)
         self.aovs.require_one_view()
         if not is_uniform(view):
-            return self._image_of(scene).render(scene, view, seed, spp, develop, evaluate)
+            return self._mitsubas(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
         return side_by_side([self.primal(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
 
     def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
         """The image itself, by one sensor."""
-        return self._image_of(scene).render(scene, sensor, seed, spp, develop, evaluate)
+        return self._mitsubas(scene, sensor, seed, spp, develop, evaluate)
 
-    def _image_of(self, scene):
+    def _mitsubas(self, scene, *how):
         spill_to_local_memory()
-        return self._images[image_plugin(scene, self.options.hide_emitters)]
+        with nothing_collected():
+            return self._images[image_plugin(scene, self.options.hide_emitters)].render(scene, *how)
 
     def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
         """A render call of this integrator as data; `film`: in place of the sensor's own."""
@@ -97,7 +99,7 @@ class TermIntegrator(ADIntegrator):
         return side_by_side([self._forward(part) for part in parts])
 
     def _forward(self, call: Call):
-        with alone(), leftovers_named():
+        with alone(), leftovers_named(), nothing_collected():
             prepared = self._prepared(call)
             with tangents_arrived(call.scene, call.sensor, prepared.facts):
                 for moving in prepared.moving:
@@ -120,7 +122,7 @@ class TermIntegrator(ADIntegrator):
             self._backward(call, share(grad_in, k, len(parts)))
 
     def _backward(self, call: Call, grad_in) -> None:
-        with alone():
+        with alone(), nothing_collected():
             prepared = self._prepared(call)
             _require_gradient_image(grad_in, self.aovs.shape(films.black(call.film)))
             grad_in = self.aovs.backward(call, prepared, grad_in)

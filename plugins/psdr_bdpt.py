@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from psdr_jit.core.collection import nothing_collected
 from psdr_jit.core.threads import alone
 from psdr_jit.driver.primal import bidirectional_image
 
@@ -26,16 +27,17 @@ class BidirectionalIntegrator(TermIntegrator):
          (Default: auto)
 
     All other parameters are those of `psdr_path`. Images and derivatives are the same in expectation; light that small
-    sources send through glass, or by way of mirrors, has less noise. Each camera sample comes with two light subpaths.
-    Light of points and spots through smooth glass and by way of smooth mirrors, which camera paths never find, is in
-    the image as well; its derivative needs a smooth reconstruction filter. Its steps belong to the budget `spps`.
+    sources send through glass, or by way of mirrors, has less noise. Each camera sample comes with two light subpaths,
+    or four where something moves. Light of points and spots through smooth glass and by way of smooth mirrors, which
+    camera paths never find, is in the image as well; its derivative needs a smooth reconstruction filter. Its steps
+    belong to the budget `spps`.
     """
 
     bidirectional = True
 
     def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
         if develop:
-            with alone():
+            with alone(), nothing_collected():
                 image = bidirectional_image(self.call(scene, sensor, seed, spp))
             if image is not None:
                 return image

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.collection import nothing_collected
 from ..core.threads import one_at_a_time
 from ..driver.prepare import prepare
 from ..edges.scene_table import scene_edges
@@ -39,7 +40,7 @@ def make_plan(scene: Any, params: Any = None, sensor: Any = 0, integrator: Any =
         raise OptionError(f"{type(integrator).__name__} has no plan: use psdr_path or psdr_bdpt")
     names = [] if params is None or isinstance(params, mi.SceneParameters) else params
     names = [names] if isinstance(names, str) else list(names)
-    with also_enabled(scene, names):
+    with also_enabled(scene, names), nothing_collected():
         prepared = prepare(integrator.call(scene, view, 0, spp))
         counts = {term.name: _count(term, job) for term, job in prepared.jobs if term.edges is not None}
     return with_edges(prepared.plan, counts)

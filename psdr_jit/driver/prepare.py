@@ -186,7 +186,7 @@ def _plan(q: Question) -> tuple[Plan, NoiseLog | None]:
     geometry = _geometry(q, call.options.plan == "lean")
     light = plan_light(call.scene, q.facts, call.options, call.memory)
     film_rests = why_film_rests(call, q.facts, light) or why_film_is_not_tried(call)
-    forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, film_rests)
+    forms, reason = forms_to_try(call.scene, q.facts, call.options, geometry, light, film_rests)
 
     def made(spp: Mapping[str, int], form: tuple[str, str], why: str) -> Plan:
         terms = decide(TERMS, q.facts_in(form[0]), call.options, geometry, spp)

@@ -28,11 +28,11 @@ NOTHING_TO_COMPARE = "there is no noise to compare the forms by"
 
 
 def forms_to_try(
-    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry, film_rests: str
+    scene: mi.Scene, facts: SceneFacts, options: Options, geometry: Geometry, light: LightPlan | None, film_rests: str
 ) -> tuple[tuple[str, ...], str]:
     """The forms that come into question, the safer one first, and the reason if there is one only.
 
-    `film_rests`: see `why_film_rests`.
+    `light`: subpaths as planned. `film_rests`: see `why_film_rests`.
     """
     if options.form in FOLLOWING and film_rests:
         return (SPATIAL,), film_rests
@@ -43,7 +43,8 @@ def forms_to_try(
         return (FILM if options.form in FOLLOWING else SPATIAL,), confined
     forms, reason = ((SPATIAL,), confined) if confined else _of_vertices(scene, facts, options, geometry)
     followed = (shape for shape in facts.shapes if facts.camera_moves or shape.moves)
-    if film_rests or not any(_uneven(shape) for shape in followed):  # else it has more noise, not less
+    uneven = (light is not None and light.runs) or any(_uneven(shape) for shape in followed)
+    if film_rests or not uneven:  # it has more noise then, not less
         return forms, reason
     following = {vertices: form for form, vertices in FOLLOWING.items()}
     return (*forms, following[forms[-1]]), NOTHING_TO_COMPARE
@@ -61,7 +62,10 @@ def _why_vertices_slide(facts: SceneFacts) -> str:
 
 
 def _uneven(shape: ShapeFacts) -> bool:
-    """Does what a pixel sees of it change as it moves: by a texture, or by where its surface turns from the viewer?"""
+    """Does what a pixel sees of it change as it moves: by a texture, or by where its surface turns from the viewer?
+
+    What light subpaths are aimed for, a caustic on it or the lobes of rough glass, is uneven on flat surfaces as well.
+    """
     flat = shape.plugin in ("rectangle", "disk") or (shape.kind == "mesh" and shape.faces < MANY_FACES)
     return shape.painted or shape.smooth or not flat
 

@@ -160,11 +160,10 @@ def test_structural_rules(llvm, case):
     name, param, depth = case
     scene = scene_of(name)
     with also_enabled(scene, [param]):
-        forms, reason = forms_to_try(scene, analyse(scene), Options(max_depth=depth), Geometry(), "")
+        facts, options, unknown = analyse(scene), Options(max_depth=depth), (Geometry(), None, "")
+        forms, reason = forms_to_try(scene, facts, options, *unknown)
         assert forms == FORMS[case] and reason
-        assert forms_to_try(scene, analyse(scene), Options(max_depth=depth, form="material"), Geometry(), "")[0] == (
-            "material",
-        )
+        assert forms_to_try(scene, facts, replace(options, form="material"), *unknown)[0] == ("material",)
 
 
 # ------------------------------------------------------------------------------------------ in use

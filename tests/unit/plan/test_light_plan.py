@@ -14,9 +14,13 @@ from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
 from psdr_jit.driver.prepare import prepare
 from psdr_jit.interior import light_traced
+from psdr_jit.options import FOLLOWING, Options
 from psdr_jit.paths.light_technique import ASLANT
+from psdr_jit.plan.form_choice import forms_to_try
 from psdr_jit.plan.job import Job
-from psdr_jit.plan.light_plan import LARGE
+from psdr_jit.plan.light_plan import LARGE, plan_light
+from psdr_jit.plan.plan import Geometry
+from psdr_jit.scene.facts import analyse
 
 BODIES = {
     "smooth": {"type": "dielectric"},
@@ -71,6 +75,18 @@ def test_places_on_the_film_follow_but_under_a_box_filter_if_light_is_traced(llv
     for lamp, kept in ((WIDE, "film"), (SMALL, "spatial")):
         found = plan_of(scene_of("smooth", lamp, rfilter="box"), **form)
         assert found.form == kept and ("light subpaths" in found.form_reason) == (kept == "spatial")
+
+
+def test_what_is_flat_is_followed_over_the_film_if_light_is_traced(llvm):
+    """Which is uneven on it."""
+    motion = perturb(scene_of("rough", SMALL), "floor.to_world", direction=[1, 0, 0])
+    motion.attach()
+    facts, options = analyse(motion.scene), Options(max_depth=4)
+    traced = plan_light(motion.scene, facts, replace(options, light_paths="auto"), None)
+    assert traced.runs
+    for light, followed in ((traced, True), (None, False)):
+        forms, _ = forms_to_try(motion.scene, facts, options, Geometry(), light, "")
+        assert any(form in FOLLOWING for form in forms) == followed
 
 
 def job_of(scene: mi.Scene) -> Job:
