@@ -56,6 +56,7 @@ class TermIntegrator(ADIntegrator):
         depths = {"max_depth": options.max_depth, "rr_depth": options.rr_depth, "hide_emitters": options.hide_emitters}
         return {name: mi.load_dict({"type": name, **depths}) for name in ("path", "prb")}
 
+    @nothing_collected()
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         require_integrator(self)
         view = find_sensor(scene, sensor)
@@ -64,18 +65,17 @@ class TermIntegrator(ADIntegrator):
             return self.aovs.beside(self.primal(scene, view, seed, spp, develop, evaluate), scene, view, seed, spp)
         self.aovs.require_one_view()
         if not is_uniform(view):
-            return self._mitsubas(scene, view, seed, spp, develop, evaluate)
+            return self._image_of(scene).render(scene, view, seed, spp, develop, evaluate)
         parts = parts_of(view, seed, spp)
         return side_by_side([self.primal(scene, p.sensor, p.seed, p.spp, True, evaluate) for p in parts])
 
     def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
         """The image itself, by one sensor."""
-        return self._mitsubas(scene, sensor, seed, spp, develop, evaluate)
+        return self._image_of(scene).render(scene, sensor, seed, spp, develop, evaluate)
 
-    def _mitsubas(self, scene, *how):
+    def _image_of(self, scene):
         spill_to_local_memory()
-        with nothing_collected():
-            return self._images[image_plugin(scene, self.options.hide_emitters)].render(scene, *how)
+        return self._images[image_plugin(scene, self.options.hide_emitters)]
 
     def call(self, scene, sensor, seed, spp, mode="forward", film=None) -> Call:
         """A render call of this integrator as data; `film`: in place of the sensor's own."""
@@ -89,6 +89,7 @@ class TermIntegrator(ADIntegrator):
         self.plan = prepared.plan
         return prepared
 
+    @nothing_collected()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         require_integrator(self)
         view = find_sensor(scene, sensor)
@@ -99,7 +100,7 @@ class TermIntegrator(ADIntegrator):
         return side_by_side([self._forward(part) for part in parts])
 
     def _forward(self, call: Call):
-        with alone(), leftovers_named(), nothing_collected():
+        with alone(), leftovers_named():
             prepared = self._prepared(call)
             with tangents_arrived(call.scene, call.sensor, prepared.facts):
                 for moving in prepared.moving:
@@ -108,6 +109,7 @@ class TermIntegrator(ADIntegrator):
                 prepared.observe(call.seed, images)
                 return self.aovs.forward(call, prepared, sum(images.values(), films.black(call.film)))
 
+    @nothing_collected()
     def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
         require_integrator(self)
         view = find_sensor(scene, sensor)
@@ -122,7 +124,7 @@ class TermIntegrator(ADIntegrator):
             self._backward(call, share(grad_in, k, len(parts)))
 
     def _backward(self, call: Call, grad_in) -> None:
-        with alone(), nothing_collected():
+        with alone():
             prepared = self._prepared(call)
             _require_gradient_image(grad_in, self.aovs.shape(films.black(call.film)))
             grad_in = self.aovs.backward(call, prepared, grad_in)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from psdr_jit.core.collection import nothing_collected
 from psdr_jit.core.threads import alone
 from psdr_jit.driver.primal import bidirectional_image
 
@@ -37,7 +36,7 @@ class BidirectionalIntegrator(TermIntegrator):
 
     def primal(self, scene, sensor, seed, spp, develop=True, evaluate=True):
         if develop:
-            with alone(), nothing_collected():
+            with alone():
                 image = bidirectional_image(self.call(scene, sensor, seed, spp))
             if image is not None:
                 return image

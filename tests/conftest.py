@@ -9,6 +9,7 @@ import pytest
 from variants import activate
 
 import psdr_jit  # noqa: F401  (registers the plugins)
+from psdr_jit.core import collection
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -26,9 +27,8 @@ def nothing_collected() -> Iterator[None]:
     wait in a cycle, that of an earlier test's exception for instance, are collected at any time.
     """
     gc.collect()
-    gc.disable()
-    yield
-    gc.enable()
+    with collection.nothing_collected():
+        yield
 
 
 @pytest.fixture(params=["llvm_ad_rgb", "cuda_ad_rgb"])

@@ -24,13 +24,37 @@ from ..plan.job import Job
 from .camera_pass import CameraPass
 
 
-def turned(job: Job, p: mi.Point2f, per_px: RayPerPixel) -> tuple[mi.Vector3f, mi.Vector3f]:
+def _turned(job: Job, p: mi.Point2f, per_px: RayPerPixel) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Displacements `(of the origin, of the direction)` of the camera rays of the places `p` as these move, attached.
 
     `per_px`: of these rays.
     """
     shift, _ = job.film_flow.at(p)
     return per_px.moved(shift)
+
+
+def camera_tangents(
+    job: Job, ray: mi.Ray3f, p: mi.Point2f, per_px: RayPerPixel | None
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """`(ȯ, ḋ)` of the attached camera rays of the places `p`, detached. `per_px`: of these, where places move."""
+    o_grad, d_grad = job.motion.camera_tangents(ray)
+    if job.film_flow is None:
+        return o_grad, d_grad
+    with dr.resume_grad(job.film_flow.nodes):
+        o, d = tangents(*_turned(job, p, per_px))
+    return o_grad + o, d_grad + d
+
+
+def camera_adjoint(
+    job: Job, ray: mi.Ray3f, p: mi.Point2f, per_px: RayPerPixel | None, λ: tuple[mi.Vector3f, mi.Vector3f]
+) -> mi.Float:
+    """⟨λ_o, o⟩ + ⟨λ_d, d⟩ of the same rays, attached: the transpose of `camera_tangents`."""
+    λ_o, λ_d = λ
+    adjoint = dr.dot(ray.o, λ_o) + dr.dot(ray.d, λ_d)
+    if job.film_flow is None:
+        return adjoint
+    o, d = _turned(job, p, per_px)
+    return adjoint + dr.dot(o, λ_o) + dr.dot(d, λ_d)
 
 
 def of_samples(job: Job, p: CameraPass, records: PathRecords, L: mi.Spectrum) -> mi.TensorXf:
@@ -50,13 +74,13 @@ def of_splats(job: Job, p: mi.Point2f, value: mi.Spectrum, wavelengths, active: 
     return films.develop_boundary(job.film, p + shift, value * (1 + div), mi.Float(0), wavelengths, active)
 
 
-def forward(job: Job, image: Callable[..., mi.TensorXf], *of) -> mi.TensorXf:
-    """Derivative of the `image` of what is given. Detached."""
+def forward(job: Job, image: Callable[[], mi.TensorXf]) -> mi.TensorXf:
+    """Derivative of an `image` of moving places. Detached."""
     with dr.resume_grad(job.film_flow.nodes):
-        return tangents(image(job, *of))
+        return tangents(image())
 
 
-def backward(job: Job, grad_in: mi.TensorXf, image: Callable[..., mi.TensorXf], *of) -> None:
+def backward(job: Job, image: Callable[[], mi.TensorXf], grad_in: mi.TensorXf) -> None:
     """Accumulate ⟨grad_in, dI⟩ into the flow."""
     with dr.resume_grad(job.film_flow.nodes):
-        backpropagate(image(job, *of), grad_in)
+        backpropagate(image(), grad_in)

@@ -7,18 +7,21 @@ How a path is found and how it flows are two things. The derivative of what all 
 V_t the contribution over the density of technique t, w_t its weight, both detached, D the relative derivative of the
 integrand along *our* flow, which is the same for every t. So a path from the light (`paths/light_walk.py`) is written
 down as the camera would have met it, and goes through the sweeps (`sweeps.py`) that all paths go through. Its film
-point is where the sensor sees x_1 now, and stays fixed while θ changes: the attached camera ray through it moves.
+point is where the sensor sees x_1 now, and stays fixed while θ changes, or goes where all places there do
+(`film_places.py`): the attached camera ray through it moves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from ..core import film as films
-from ..core.ad import accumulate, backpropagate, tangents
+from ..core.ad import accumulate, backpropagate
 from ..core.camera_rays import RayNumbers, RayPerPixel, ray_per_pixel
 from ..core.low_discrepancy import lane_sampler
 from ..core.streams import Stream, stream_seed
@@ -132,8 +135,9 @@ def _splat(job: Job, found: TurnedPaths, values: mi.Spectrum) -> mi.TensorXf:
 
 
 def _camera_ray(job: Job, found: TurnedPaths) -> mi.Ray3f:
-    """The attached camera rays through the fixed film points."""
-    ray, _ = job.sensor.sample_ray(0, 0.5, found.path.film, found.path.aperture)
+    """The attached camera rays through the film points."""
+    with dr.resume_grad():
+        ray, _ = job.sensor.sample_ray(0, 0.5, found.path.film, found.path.aperture)
     return ray
 
 
@@ -155,30 +159,20 @@ def backward(job: Job, found: LightTraced, flow: Flow, grad_in: mi.TensorXf) -> 
         light_borne.backward(found.borne, grad_in)
 
 
-def _moved(job: Job, found: TurnedPaths, L: mi.Spectrum) -> tuple:
-    """What `film_places` needs of the radiance `L` of the paths."""
+def _moved(job: Job, found: TurnedPaths, L: mi.Spectrum) -> Callable[[], mi.TensorXf]:
+    """The image of the radiance `L` of the paths, as their film points move."""
     value = job.call.counters.rejected.keep_finite(L) * found.weight
-    return film_places.of_splats, found.path.p, value, found.wavelengths, found.records.count > 0
-
-
-def _turned_rays(job: Job, found: TurnedPaths) -> tuple[mi.Vector3f, mi.Vector3f]:
-    return film_places.turned(job, found.path.p, found.per_px)
+    return partial(film_places.of_splats, job, found.path.p, value, found.wavelengths, found.records.count > 0)
 
 
 def _forward(job: Job, found: TurnedPaths, flow: Flow) -> mi.TensorXf:
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
-    if job.facts.camera_moves:
-        with dr.resume_grad():
-            ray = _camera_ray(job, found)
-        o_grad, d_grad = job.motion.camera_tangents(ray)
-    if job.film_flow is not None:
-        with dr.resume_grad(job.film_flow.nodes):
-            o, d = tangents(*_turned_rays(job, found))
-        o_grad, d_grad = o_grad + o, d_grad + d
+    if job.facts.view_moves:
+        o_grad, d_grad = film_places.camera_tangents(job, _camera_ray(job, found), found.path.p, found.per_px)
     dL, L = forward_sweep(found.records, o_grad, d_grad, flow, job.motion)
     image = _splat(job, found, job.call.counters.rejected.keep_finite(dL))
     if job.film_flow is not None:
-        image += film_places.forward(job, *_moved(job, found, L))
+        image += film_places.forward(job, _moved(job, found, L))
     return image
 
 
@@ -190,13 +184,11 @@ def _backward(job: Job, found: TurnedPaths, flow: Flow, grad_in: mi.TensorXf) ->
         δL = dr.grad(values)
     films.clear(job.film)
     λ_o, λ_d, L = backward_sweep(found.records, δL, flow, job.motion)
-    dr.eval(λ_o, λ_d, L)  # stored, as in `term`: a pose asks for each of them twelve times
-    if job.facts.camera_moves:
+    if job.facts.view_moves:
+        # stored, as in `term`: a pose asks for each of them twelve times
+        dr.eval(λ_o, λ_d, *([] if job.film_flow is None else [L]))
+        ray = _camera_ray(job, found)
         with dr.resume_grad():
-            ray = _camera_ray(job, found)
-            accumulate(dr.dot(ray.o, λ_o) + dr.dot(ray.d, λ_d))
+            accumulate(film_places.camera_adjoint(job, ray, found.path.p, found.per_px, (λ_o, λ_d)))
     if job.film_flow is not None:
-        with dr.resume_grad(job.film_flow.nodes):
-            o, d = _turned_rays(job, found)
-            accumulate(dr.dot(o, λ_o) + dr.dot(d, λ_d))
-        film_places.backward(job, grad_in, *_moved(job, found, L))
+        film_places.backward(job, _moved(job, found, L), grad_in)

@@ -57,6 +57,7 @@ class RimPass:
     p: mi.Point2f  # [px]
 
     sought = True  # every one of them meets what moves
+    per_px = None  # film positions rest
 
     @property
     def count(self) -> int:

@@ -8,11 +8,12 @@ Where that has turned out to be most of them, an integrator no longer looks.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.ad import accumulate, tangents
+from ..core.ad import accumulate
 from ..core.memory import Slot
 from ..core.streams import Stream
 from ..edges.followed_lights import followed_lights
@@ -167,7 +168,7 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
     o_grad, d_grad = mi.Vector3f(0), mi.Vector3f(0)
     known = p if job.film_flow is None else p.of(lane)
     if job.facts.view_moves:
-        o_grad, d_grad = _camera_tangents(job, known)
+        o_grad, d_grad = film_places.camera_tangents(job, known.ray, known.p, known.per_px)
         o_grad = o_grad + _skipped(job, known, records) * d_grad
     recorded, L = forward_sweep(records, o_grad, d_grad, flow_of(job), job.motion)
     keep_finite = job.call.counters.rejected.keep_finite
@@ -177,17 +178,7 @@ def _derivative(job: Job, p: CameraPass | RimPass) -> mi.TensorXf:
         return p.develop(job.film, dL)
     L = keep_finite(L)
     dr.eval(dL, L)
-    return p.develop(job.film, dL) + film_places.forward(job, film_places.of_samples, known, records, L)
-
-
-def _camera_tangents(job: Job, p: CameraPass | RimPass) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """`(ȯ, ḋ)` of the camera rays of a pass."""
-    o_grad, d_grad = job.motion.camera_tangents(p.ray)
-    if job.film_flow is None:
-        return o_grad, d_grad
-    with dr.resume_grad(job.film_flow.nodes):
-        o, d = tangents(*film_places.turned(job, p.p, p.per_px))
-    return o_grad + o, d_grad + d
+    return p.develop(job.film, dL) + film_places.forward(job, partial(film_places.of_samples, job, known, records, L))
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -238,14 +229,11 @@ def _accumulate_adjoint(job: Job, p: CameraPass | RimPass, share: float, grad_in
         # Stored: each entry of the pose is a sum over all samples, in a kernel that would walk back anew.
         dr.eval(λ_o, λ_d, *([] if job.film_flow is None else [L]))
         with dr.resume_grad():
-            adjoint = dr.dot(p.ray.o, λ_o) + dr.dot(p.ray.d, λ_d)
-            if job.film_flow is not None:
-                o, d = film_places.turned(job, p.p, p.per_px)
-                adjoint += dr.dot(o, λ_o) + dr.dot(d, λ_d)
-            accumulate(adjoint)  # other terms need the sensor's edges
+            # other terms need the sensor's edges
+            accumulate(film_places.camera_adjoint(job, p.ray, p.p, p.per_px, (λ_o, λ_d)))
     if job.film_flow is not None:
         L = job.call.counters.rejected.keep_finite(L)
-        film_places.backward(job, share * grad_in, film_places.of_samples, p, records, L)
+        film_places.backward(job, partial(film_places.of_samples, job, p, records, L), share * grad_in)
     dr.eval()
 
 

@@ -191,7 +191,7 @@ class FilmMotion(Motion):
             yield FilmDisplacements(moving, self.flow)
 
     def camera_tangents(self, ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """At places that rest: of a ray alone nobody can tell where on the film it is, see `film_places.turned`."""
+        """At places that rest: a ray alone does not tell where on the film it is, see `film_places.camera_tangents`."""
         return self.base.camera_tangents(ray)
 
 

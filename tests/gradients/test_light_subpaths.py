@@ -22,13 +22,10 @@ from helpers import (
 )
 from problems import Problem
 
-from benchmarks.check_lists.caustics import UP
-from benchmarks.check_lists.caustics import scene as below_a_lamp
 from psdr_jit import make_plan
 from psdr_jit.cli.main import main
 from psdr_jit.derivative import integrator_specs
 from psdr_jit.derivative.perturbation import perturb
-from psdr_jit.derivative.sampler import DerivativeSampler
 from psdr_jit.errors import UnsupportedWarning
 from psdr_jit.plan.plan import Plan
 from psdr_jit.scene import io as scene_io
@@ -297,11 +294,3 @@ def test_words(llvm):
     text = '<scene version="3.0.0"><integrator type="psdr_bdpt"><integer name="sppc" value="7"/></integrator></scene>'
     options = mi.load_string(text).integrator().options
     assert options.sppc == 7 and options.light_paths == "auto"
-
-
-def test_light_that_passes_along_an_outline_is_no_outlier(llvm):
-    """Light met the ball at a cosine of 4e-7, which had one pixel at 2094 where none is above 4."""
-    ball = {"type": "roughconductor", "alpha": 0.05, "distribution": "ggx"}
-    motion = perturb(below_a_lamp("ball", ball, "spot"), "floor.to_world", UP)
-    spec = bdpt(**{**QUICK, "sppd": 0})
-    assert np.abs(DerivativeSampler(motion, integrator_specs.build(spec), 0, 64).render(23)).max() < 20
