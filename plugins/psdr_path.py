@@ -41,8 +41,8 @@ class PathSpaceIntegrator(TermIntegrator):
      * - form
        - |string|
        - What path vertices do while a parameter changes: `spatial` (slide along their rays), `material` (stay on their
-         surfaces), `film` (places on the film follow what a moving camera sees) or `auto`, whichever suits the scene
-         (Default: auto)
+         surfaces), `mixed` (stay there, but beside corners and contacts), `film`, `film-material` and `film-mixed`
+         (the same, and places on the film follow what is seen) or `auto`, whichever suits the scene (Default: auto)
      * - plan
        - |string|
        - `lean` leaves out what is certainly 0, `full` computes everything, for comparison; or the text of a plan that

@@ -11,18 +11,19 @@ from .errors import OptionError, did_you_mean
 #: `max_depth = -1` in a scene file: unlimited. Mitsuba's own encoding.
 UNLIMITED = 0xFFFFFFFF
 
-#: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points.
-SPATIAL, MATERIAL = "spatial", "material"
+#: What path vertices do while θ changes [Zhang et al. 2020]: slide along their rays, or stay on their material points;
+#: or stay there, but behind a vertex with another surface close by.
+SPATIAL, MATERIAL, MIXED = "spatial", "material", "mixed"
 
 #: The same where places on the film follow what is seen there, and what vertices do in each.
-FILM, FILM_MATERIAL = "film", "film-material"
-FOLLOWING = {FILM: SPATIAL, FILM_MATERIAL: MATERIAL}
+FILM, FILM_MATERIAL, FILM_MIXED = "film", "film-material", "film-mixed"
+FOLLOWING = {FILM: SPATIAL, FILM_MATERIAL: MATERIAL, FILM_MIXED: MIXED}
 
-FORMS = (SPATIAL, MATERIAL, *FOLLOWING)
+FORMS = (SPATIAL, MATERIAL, MIXED, *FOLLOWING)
 
 
 def of_vertices(form: str) -> str:
-    """What path vertices do in a form, wherever places on the film are: SPATIAL or MATERIAL."""
+    """What path vertices do in a form, wherever places on the film are: SPATIAL, MATERIAL or MIXED."""
     return FOLLOWING.get(form, form)
 
 

@@ -16,6 +16,7 @@ The sensor subpath of m vertices leaves max_depth − 1 − m segments beyond th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
@@ -35,6 +36,7 @@ from ..sampling.horizons import horizon_weights, sampled_horizons
 from ..sampling.relevance import SecondaryEdges, line_weights, secondary_edges
 from ..scene.facts import SceneFacts
 from . import horizons, indirect_material, indirect_orbits, segment_motion
+from .close_receivers import at_close_receivers, at_open_receivers
 from .edge_lines import EdgeView, longest_path, longest_subpath, radiance_by_depth, sample_lines, slots, trace_receivers
 from .segment_motion import BoundarySamples, SecondaryTerm, source_rests
 from .sensor_subpath import Receivers, SubpathRecords, subpaths
@@ -112,8 +114,12 @@ def _both_sides(job: Job, table: EdgeTable, view: EdgeView, vertices: int):
     return *radiance_by_depth(job, ray, pi, v.lane, limits, differs, emission), followed
 
 
-#: What its lines are drawn for, by form.
-USES = {"spatial": Use.STEP, "material": Use.BACKGROUND}
+#: What its lines are drawn for, by form; in the mixed one, those of most receivers.
+USES = {"spatial": Use.STEP, "material": Use.BACKGROUND, "mixed": Use.BACKGROUND}
+
+#: Share of the samples, in the mixed form, for receivers with another surface close by. They are few, and what lines
+#: bring to all others is left out.
+CLOSE_SHARE = 0.125
 
 #: How the term is estimated, by form.
 ESTIMATORS = {
@@ -160,13 +166,22 @@ def _turning(part: SecondaryTerm) -> SecondaryTerm:
 
 def parts(job: Job) -> list[tuple[SecondaryTerm, Job]]:
     """What the term consists of, each with its share of the samples: edges, and horizons if faces are coarse."""
-    edges = ESTIMATORS[job.form]
-    found = [(edges, job)]
-    if any(shape.smooth for shape in job.facts.shapes):
-        found = horizons.shared_out(job, HORIZONS[job.form], [edges])
+    if job.form == "mixed":
+        close = max(1, round(CLOSE_SHARE * job.spp))
+        at_close = _parts(replace(job, spp=close, guide=None, tally=None), "spatial", at_close_receivers)
+        return at_close + _parts(replace(job, spp=max(1, job.spp - close)), "material", at_open_receivers)
+    found = _parts(job, job.form, lambda part: part)
     if job.orbits is not None:
         found += [(_turning(part), share) for part, share in found]
     return found
+
+
+def _parts(job: Job, form: str, at: Callable[[SecondaryTerm], SecondaryTerm]) -> list[tuple[SecondaryTerm, Job]]:
+    """Those of a form, `at` some of the receivers."""
+    edges = at(ESTIMATORS[form])
+    if any(shape.smooth for shape in job.facts.shapes):
+        return horizons.shared_out(job, at(HORIZONS[form]), [edges])
+    return [(edges, job)]
 
 
 def forward(job: Job) -> mi.TensorXf:
@@ -199,7 +214,7 @@ def needed(facts: SceneFacts, options: Options, geometry: Geometry) -> Verdict:
 
 def cost(form: str, sky: bool) -> float:
     """Time of a path relative to one of the interior term (medians over the shipped scenes, two cores)."""
-    return 0.6 if form == "material" else 0.9  # in material form one side of an edge is traced
+    return {"material": 0.6, "mixed": 0.7}.get(form, 0.9)  # in material form one side of an edge is traced
 
 
 TERM = Term(

@@ -9,6 +9,7 @@ that subpath moves,
 with ω_k the direction of travel, away from the sensor, in which vertex k is reached. For one covector a applied to u_D
 the adjoint runs in walking order: deposit g = n (a·ω)/(n·ω) on v, then a ← a − g; what is left acts on the camera ray.
 
+In the mixed form a vertex slides where the one nearer to the sensor has another surface close by.
 In the material form only the first vertex of a light path slides. Hence a receiver that sees the sensor takes its
 deposit as above, one further along moves with its surface: all of a acts on its own v, and nothing is carried on.
 
@@ -37,6 +38,7 @@ from ..paths.surface_at import surface_at
 from ..plan.job import Job
 from .awaited import Awaited
 from .delta_adjoint import DeltaRecords, DeltaTurn, carried_along, through_vertex
+from .deposits import carried_off, deposit
 
 #: Vertices of a sensor subpath that are recorded when the depth is unlimited.
 UNLIMITED_VERTICES = 32
@@ -201,12 +203,6 @@ def subpaths(job: Job, stream: Stream, receivers: Receivers, longest: int) -> Su
     return records
 
 
-def deposit(a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
-    """Covector n (a·ω)/(n·ω) that a vertex with normal n receives; 0 at exactly grazing incidence."""
-    cos = dr.dot(n, ω)
-    return mi.Vector3f(n) * dr.select(cos != 0, dr.dot(a, ω) / cos, 0)
-
-
 @dataclass
 class _AtSensor:
     """How the sensor sees a vertex, and what a path that ends there would be worth. Detached."""
@@ -257,9 +253,11 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
         )
         following = onward.ray(si)
         g_connect = deposit(a, si.n, end.view.ω)
-        g_continue = _carried_off(job.form, a, si.n, -following.d)
+        path, goes_on = onward.path, onward.alive & (onward.path.k <= limits.max_depth)
+        found = job.scene.ray_intersect_preliminary(following, coherent=False, active=goes_on)
+        g_continue = carried_off(job, a, si.n, following, found, goes_on)
         records.write(
-            path.k - 1,
+            path.k - 2,
             Connection(
                 Hit.of(ray, pi),
                 g_connect,
@@ -273,8 +271,6 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
             active,
         )
         a -= g_continue
-        path, goes_on = onward.path, onward.alive & (onward.path.k <= limits.max_depth)
-        found = job.scene.ray_intersect_preliminary(following, coherent=False, active=goes_on)
         if dr.hint(records.delta is not None, mode="scalar"):
             delta = onward.alive & onward.scattering.delta
             turned, bent = through_vertex(job.surfaces, pi, si, bsdf, b, -following.d, -ray.d, delta)
@@ -286,8 +282,3 @@ def walk_to_sensor(job: Job, receivers: Receivers, sampler, limits: PathLimits, 
             records.delta.write(path.k - 2, turn, delta, through, active)
             a, b = a - q, arriving
         ray, pi, active = following, found, goes_on & found.is_valid()
-
-
-def _carried_off(form: str, a: mi.Vector3f, n: mi.Normal3f, ω: mi.Vector3f) -> mi.Vector3f:
-    """What a vertex keeps of the covector if the path goes on: in the material form all of it, it does not slide."""
-    return deposit(a, n, ω) if form == "spatial" else mi.Vector3f(a)

@@ -143,6 +143,15 @@ class Vertex:
 
 
 @dataclass
+class Place:
+    """A vertex among those of its path."""
+
+    first: mi.Bool
+    slides: mi.Bool  # in the mixed form: the vertex slides along the ray that reaches it ...
+    slides_next: mi.Bool  # ... and so does the one after it
+
+
+@dataclass
 class Arrival:
     """The part of a `Vertex` that its predecessor needs: how the sampled direction went on."""
 

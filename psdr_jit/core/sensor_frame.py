@@ -176,6 +176,14 @@ def towards_viewer(view: mi.Vector4f, x: mi.Point3f) -> mi.Vector3f:
     return mi.Vector3f(view.x, view.y, view.z) - view.w * mi.Vector3f(x)
 
 
+def view_width(frame: SensorFrame, x: mi.Point3f) -> mi.Float:
+    """Width of what the film shows at the distance of x [m], of a square film of the same area."""
+    width = dr.sqrt(dr.abs(frame.extent.x * frame.extent.y))
+    if frame.kind == "orthographic":
+        return width * dr.sqrt(frame.stretch[0])
+    return width * dr.norm(towards_viewer(viewpoint(frame, mi.Point2f(0.5)), x))
+
+
 def pixel_footprint(frame: SensorFrame, x: mi.Point3f, ω: mi.Vector3f) -> mi.Float:
     """`View.J_px` of a point x (world) that is met by a viewing ray of direction ω, whichever lens point it is from."""
     if frame.kind == "orthographic":

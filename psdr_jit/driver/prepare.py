@@ -18,7 +18,7 @@ from ..core.memory import Memory, Slot
 from ..edges.convexity import lone_convex
 from ..edges.followed_lights import followed_lights
 from ..errors import OptionError, UnsupportedError, ZeroDerivativeWarning
-from ..options import FOLLOWING, MATERIAL, SPATIAL, Options, of_vertices, require_runtime, samples_per_pixel
+from ..options import FOLLOWING, MATERIAL, MIXED, SPATIAL, Options, of_vertices, require_runtime, samples_per_pixel
 from ..plan.call import Call
 from ..plan.decide import decide, make_plan_of
 from ..plan.form_choice import forms_to_try, why_film_is_not_tried, why_film_rests
@@ -225,7 +225,7 @@ def _geometry(q: Question, prunes: bool) -> Geometry:
     if not q.facts.geometry_moves:
         return Geometry()
     alone = lone_convex(call.scene, call.sensor, q.facts, call.memory) if prunes else ""
-    if of_vertices(call.options.form) == MATERIAL:
+    if of_vertices(call.options.form) in (MATERIAL, MIXED):
         return Geometry(alone)
     lights = followed_lights(q.job(Plan(SPATIAL, "", "", (), prunes), 1))
     return Geometry(alone, "" if lights is None else lights.names[0])

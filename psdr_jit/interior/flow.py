@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.records import Arrival, EmitterSample, Hit, Vertex
+from ..core.records import Arrival, EmitterSample, Hit, Place, Vertex
 from ..edges.followed_lights import FollowedLights
 from ..paths.delta_step import delta_step
 from ..paths.edge_on import GRAZING, GRAZING_FLAT, least_cosine
@@ -80,11 +80,11 @@ class Flow(ABC):
 
     @abstractmethod
     def terms(
-        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
+        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, at: Place, moves: Displacements
     ) -> VertexTerms:
         """Terms of `vertex`, reached along the attached `ray`; `following` is where the sampled direction leads.
 
-        `first`: lanes whose vertex is the first of its path. Called where displacements are attached.
+        `at`: which of its path's vertices it is. Called where displacements are attached.
         """
 
 

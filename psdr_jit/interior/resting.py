@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.records import Arrival, Vertex
+from ..core.records import Arrival, Place, Vertex
 from ..paths.surface_at import surface_at
 from ..plan.motion import Displacements
 from .flow import Flow, SceneTraits, VertexTerms, delta_factor
@@ -24,7 +24,7 @@ class RestingFlow(Flow):
     traits: SceneTraits
 
     def terms(
-        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
+        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, at: Place, moves: Displacements
     ) -> VertexTerms:
         si = surface_at(self.traits.surfaces, vertex.hit.intersection(), ray, mi.RayFlags.All)
         bsdf = si.bsdf()

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.records import Arrival, Vertex
+from ..core.records import Arrival, Place, Vertex
 from ..paths.delta_step import delta_step
 from ..paths.recording import PathRecords
 from ..plan.motion import Displacements
@@ -40,11 +40,11 @@ class SpatialFlow(Flow):
         return records.scattering()  # what others than the first emit is among the terms of those before them
 
     def terms(
-        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, first: mi.Bool, moves: Displacements
+        self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, at: Place, moves: Displacements
     ) -> VertexTerms:
         si = moves.surface(vertex.hit, ray, mi.RayFlags.All)
         bsdf = si.bsdf()
-        L = dr.select(first, vertex.weight_emission * si.emitter(self.scene).eval(si, first), 0)
+        L = dr.select(at.first, vertex.weight_emission * si.emitter(self.scene).eval(si, at.first), 0)
         L += next_event(si, bsdf, vertex.nee, self.traits, moves)
 
         goes_on, inv_pdf = vertex.onward.goes_on(), vertex.onward.inv_pdf()

@@ -39,9 +39,10 @@ def backward_sweep(records: PathRecords, δL: mi.Spectrum, flow: Flow, motion: M
         k -= 1
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & v.onward.goes_on())
+        at = records.place(k, active)
         o, d = mi.Point3f(v.hit.o), mi.Vector3f(v.hit.d)
         with motion.attached(o, d) as moving:
-            t = flow.terms(v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, moving)
+            t = flow.terms(v, following, mi.Ray3f(o, d, 0, records.wavelengths), at, moving)
             Lo = t.L + t.w * rest
             dr.backward_from(dr.sum(δL * v.β * Lo) + dr.dot(λ_o, t.x) + dr.dot(λ_d, t.d))
             λ_o = mi.Vector3f(dr.grad(o))
@@ -68,11 +69,12 @@ def forward_sweep(records: PathRecords, o_grad: mi.Vector3f, d_grad: mi.Vector3f
     while dr.hint(active, label="psdr.interior.forward", exclude=[flow, motion]):
         v = records.vertex(k, active)
         following = records.arrival(k + 1, active & v.onward.goes_on())
+        at = records.place(k, active)
         o, d = mi.Point3f(v.hit.o), mi.Vector3f(v.hit.d)
         with motion.attached(o, d) as moving:
             dr.set_grad(o, o_grad)
             dr.set_grad(d, d_grad)
-            t = flow.terms(v, following, mi.Ray3f(o, d, 0, records.wavelengths), k == 0, moving)
+            t = flow.terms(v, following, mi.Ray3f(o, d, 0, records.wavelengths), at, moving)
             # x is an input of L: keep the gradients of interior nodes until they have been read
             L_grad, w_grad, x_grad, onward_grad = tangents(t.L, t.w, t.x, t.d)
         dL += β_grad * dr.detach(t.L) + v.β * L_grad

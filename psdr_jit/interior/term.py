@@ -35,13 +35,14 @@ from .along_walk import MaterialTangents, RadianceTangents
 from .camera_pass import CameraPass, camera_passes
 from .flow import Flow, SceneTraits
 from .material import MaterialFlow
+from .mixed import MixedFlow
 from .resting import RestingFlow
 from .spatial import SpatialFlow
 from .sphere_rims import RimPass, SphereRims, with_rims
 from .sweeps import backward_sweep, forward_sweep
 
 #: What vertices do from the second on, by form: slide along their rays, or stay on their material.
-FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow}
+FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow, "mixed": MixedFlow}
 
 #: Share of the paths that had a derivative when they were looked for last, by an integrator.
 TOUCHED_SHARE: Slot[float] = Slot(float)
@@ -131,6 +132,8 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
     dr.eval(records.count, records.vertices, records.whole)  # at once: what is read later would trace the paths again
     if facts.geometry_moves:
         job.call.counters.grazing.count(records.cut())
+    if job.close_by is not None:
+        records.note_close_by(job.close_by, job.surfaces)
     return records, lane
 
 

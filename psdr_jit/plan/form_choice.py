@@ -2,15 +2,17 @@
 
 Where surfaces of different velocity touch, the geometry term of the material form has a derivative ~ Δv/r of infinite
 variance, whose integral is not absolutely convergent: it leaves out what light between the two does in the very corner.
-The spatial form has no such kernel, but finds an edge at every visible crease.
+The spatial form has no such kernel, but finds an edge at every visible crease. The mixed form is material where nothing
+is close by.
 """
 
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 
 from ..core.sensor_frame import KINDS
-from ..options import FILM, FOLLOWING, MATERIAL, SPATIAL, Options, of_vertices
+from ..options import FILM, FOLLOWING, MATERIAL, MIXED, SPATIAL, Options, of_vertices
 from ..scene.capabilities import WITHOUT_MATERIAL
 from ..scene.facts import SceneFacts, ShapeFacts
 from .call import Call
@@ -98,21 +100,34 @@ def _of_vertices(
         return (SPATIAL,), "light is scattered once at most, so the forms are the same"
     if geometry.touched_lamp:
         return (SPATIAL,), f"'{geometry.touched_lamp}' touches what it shines on"
-    touching = _touching(scene, facts)
-    if touching:
-        return (SPATIAL,), f"{touching} touch and move against each other"
+    movers, slid_over = _touching(scene, facts)
+    if movers:
+        return (SPATIAL, MIXED), f"{movers} touch and move against each other"
+    if slid_over:
+        return (SPATIAL, MIXED), f"{slid_over} touch, and what is seen slides over both"
     return (SPATIAL, MATERIAL), NOTHING_TO_COMPARE
 
 
-def _touching(scene: mi.Scene, facts: SceneFacts) -> str:
-    """Two shapes of which one moves and the other rests, and whose bounding boxes touch; "" if there are none."""
-    shapes = scene.shapes()
+def _touching(scene: mi.Scene, facts: SceneFacts) -> tuple[str, str]:
+    """Two shapes whose bounding boxes touch: of which one moves and the other rests; and of which both do either while
+    the camera, or both of them, move before it. "" if there are none.
+    """
     known = [s for s in facts.shapes if s.index >= 0]
-    for mover in (s for s in known if s.moves):
-        for other in (s for s in known if not s.moves):
-            a, b = shapes[mover.index].bbox(), shapes[other.index].bbox()
-            gap = max(max(b.min[i] - a.max[i], a.min[i] - b.max[i]) for i in range(3))
-            size = min(box.bounding_sphere().radius * 2 for box in (a, b))
-            if gap <= CONTACT * size:
-                return f"'{mover.name}' and '{other.name}'"
-    return ""
+    if len(known) < 2:
+        return "", ""
+    shapes = scene.shapes()
+    boxes = [shapes[s.index].bbox() for s in known]
+    lower, upper = (np.array(corner, float) for corner in ([b.min for b in boxes], [b.max for b in boxes]))
+    size = np.linalg.norm(upper - lower, axis=1)
+    gap = (lower[:, None] - upper).max(-1)  # of the second from the first, on one side
+    touch = np.triu(np.maximum(gap, gap.T) <= CONTACT * np.minimum(size[:, None], size), 1)
+    moves = np.array([s.moves for s in known])
+    against = moves[:, None] != moves
+    slid = ~against & (facts.camera_moves | moves)
+    return _named(known, touch & against), _named(known, touch & slid)
+
+
+def _named(shapes: list[ShapeFacts], pairs: np.ndarray) -> str:
+    """The first of the pairs, "" if there are none."""
+    a, b = (int(k[0]) if len(k) else -1 for k in np.nonzero(pairs))
+    return "" if a < 0 else f"'{shapes[a].name}' and '{shapes[b].name}'"

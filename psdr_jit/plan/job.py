@@ -16,6 +16,7 @@ from ..core.memory import Memory, Slot
 from ..core.sensor_frame import SensorFrame, sensor_frame
 from ..core.varying import varying
 from ..options import Options, of_vertices
+from ..paths.close_by import CloseBy
 from ..paths.critical_angle import CriticalAngle, critical_angle
 from ..paths.edge_on import EdgeOn
 from ..paths.light_technique import LightTechnique
@@ -101,7 +102,7 @@ class Job:
 
     @property
     def form(self) -> str:
-        """What path vertices do while θ changes, "spatial" or "material"."""
+        """What path vertices do while θ changes, "spatial", "material" or "mixed"."""
         return of_vertices(self.plan.form)
 
     @property
@@ -148,6 +149,11 @@ class Job:
         if not any(name.endswith((".alpha", ".eta")) for shape in self.facts.shapes for name in shape.material):
             return None
         return self.shared.once(ROUGH_PLASTIC, lambda: rough_plastic(self.scene, self.call.memory))
+
+    @property
+    def close_by(self) -> CloseBy | None:
+        """Tells behind which vertices paths slide, in the mixed form; None in the others."""
+        return CloseBy(self.scene, self.frame) if self.form == "mixed" else None
 
     @property
     def orbits(self) -> Orbits | None:

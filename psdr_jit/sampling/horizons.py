@@ -155,7 +155,7 @@ def all_around() -> Targets:
 def _sources_move(job: Job, direct: bool) -> bool:
     """Can anything but the faces themselves move against their horizons?"""
     facts = job.facts
-    return facts.shapes_move and (direct or job.form == "material")
+    return facts.shapes_move and (direct or job.form != "spatial")
 
 
 def spread(face: Face) -> mi.Float:

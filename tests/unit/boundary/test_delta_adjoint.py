@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psdr_jit.boundary.delta_adjoint import DeltaRecords, DeltaTurn, through_vertex
-from psdr_jit.boundary.sensor_subpath import deposit
+from psdr_jit.boundary.deposits import deposit
 from psdr_jit.core.ad import tangents
 from psdr_jit.core.records import Hit
 from psdr_jit.derivative.perturbation import perturb
