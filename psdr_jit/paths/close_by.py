@@ -15,7 +15,7 @@ import mitsuba as mi
 from ..core.sensor_frame import SensorFrame, view_width
 
 #: Length of the rays, relative to the width of what the film shows at the distance of x.
-REACH = 1e-3
+REACH = 3e-3
 
 #: Rays around the normal; one more goes along it.
 AROUND = 6

@@ -39,7 +39,7 @@ def case_of(seed: int) -> Case:
 
 def _integrator(draw: Draw) -> dict:
     spec = {"type": "psdr_path", "max_depth": draw.weighted({1: 1, 2: 4, 3: 4, 4: 2}),
-            "form": draw.weighted({"spatial": 3, "material": 3, "auto": 2}),
+            "form": draw.weighted({"spatial": 3, "material": 2, "mixed": 1, "auto": 2}),
             "rr_depth": draw.weighted({1000: 4, 2: 1})}  # fmt: skip
     return {**spec, "hide_emitters": True} if draw.chance(0.12) else spec
 

@@ -136,7 +136,9 @@ def test_it_is_the_same_where_vertices_keep_to_their_surfaces(llvm, case):
     assert_grad_close(ours, forward(motion, spec_of(motion.scene, **SPATIAL), SEEDS, SPP))
 
 
-@pytest.mark.parametrize("form", [FILM, also(FILM_MATERIAL)], ids=["film", "film-material"])
+@pytest.mark.parametrize(
+    "form", [FILM, also(FILM_MATERIAL), also({"form": "film-mixed"})], ids=["film", "film-material", "film-mixed"]
+)
 @pytest.mark.parametrize("case", [*EACH[:1], "turned", *EACH[2:]])
 def test_forward_and_backward_are_transposes(llvm, case, form):
     assert_transposes(case, form, "gaussian")
