@@ -22,6 +22,9 @@ from .plan import Geometry
 #: Distance between bounding boxes, relative to the diagonal of the smaller one, up to which shapes count as touching.
 CONTACT = 0.02
 
+#: Shapes beyond which nobody looks at all pairs of them: the mixed form is right in any case.
+MANY_SHAPES = 300
+
 #: Faces from which a mesh may be round.
 MANY_FACES = 100
 
@@ -100,34 +103,24 @@ def _of_vertices(
         return (SPATIAL,), "light is scattered once at most, so the forms are the same"
     if geometry.touched_lamp:
         return (SPATIAL,), f"'{geometry.touched_lamp}' touches what it shines on"
-    movers, slid_over = _touching(scene, facts)
-    if movers:
-        return (SPATIAL, MIXED), f"{movers} touch and move against each other"
-    if slid_over:
-        return (SPATIAL, MIXED), f"{slid_over} touch, and what is seen slides over both"
-    return (SPATIAL, MATERIAL), NOTHING_TO_COMPARE
+    touching = _touching(scene, facts)
+    return ((SPATIAL, MIXED), touching) if touching else ((SPATIAL, MATERIAL), NOTHING_TO_COMPARE)
 
 
-def _touching(scene: mi.Scene, facts: SceneFacts) -> tuple[str, str]:
-    """Two shapes whose bounding boxes touch: of which one moves and the other rests; and of which both do either while
-    the camera, or both of them, move before it. "" if there are none.
-    """
-    known = [s for s in facts.shapes if s.index >= 0]
-    if len(known) < 2:
-        return "", ""
-    shapes = scene.shapes()
+def _touching(scene: mi.Scene, facts: SceneFacts) -> str:
+    """Two shapes whose bounding boxes touch, and of which one moves, or the camera before them; "" if none do."""
+    known, shapes = [s for s in facts.shapes if s.index >= 0], scene.shapes()
+    if len(known) > MANY_SHAPES:
+        return f"of {len(known)} shapes, some may touch"
     boxes = [shapes[s.index].bbox() for s in known]
-    lower, upper = (np.array(corner, float) for corner in ([b.min for b in boxes], [b.max for b in boxes]))
+    corners = np.array([(*b.min, *b.max) for b in boxes], float).reshape(-1, 2, 3)
+    lower, upper = corners[:, 0], corners[:, 1]
     size = np.linalg.norm(upper - lower, axis=1)
-    gap = (lower[:, None] - upper).max(-1)  # of the second from the first, on one side
-    touch = np.triu(np.maximum(gap, gap.T) <= CONTACT * np.minimum(size[:, None], size), 1)
-    moves = np.array([s.moves for s in known])
-    against = moves[:, None] != moves
-    slid = ~against & (facts.camera_moves | moves)
-    return _named(known, touch & against), _named(known, touch & slid)
-
-
-def _named(shapes: list[ShapeFacts], pairs: np.ndarray) -> str:
-    """The first of the pairs, "" if there are none."""
-    a, b = (int(k[0]) if len(k) else -1 for k in np.nonzero(pairs))
-    return "" if a < 0 else f"'{shapes[a].name}' and '{shapes[b].name}'"
+    gap = np.maximum(lower - upper[:, None], lower[:, None] - upper).max(2)
+    for a, b in np.argwhere(np.triu(gap <= CONTACT * np.minimum(size, size[:, None]), 1)):
+        one, other = known[a], known[b]
+        if one.moves != other.moves:
+            return f"'{one.name}' and '{other.name}' touch and move against each other"
+        if one.moves or facts.camera_moves:
+            return f"'{one.name}' and '{other.name}' touch, and what is seen slides over both"
+    return ""

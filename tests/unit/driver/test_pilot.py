@@ -146,6 +146,8 @@ def test_the_probe_is_the_derivative_along_its_motion(llvm, form, scene_name, pa
 
 FORMS = {  # (scene, parameter, depth): forms that come into question
     ("cbox", BOX, 4): ("spatial", "mixed"),  # next to the large box
+    ("cbox", "sensor.to_world", 4): ("spatial", "mixed"),  # walls touch, and all is slid over
+    ("sunk_ball", "ball.to_world", 4): ("spatial", "mixed", "film-mixed"),
     ("area_shadow", "blocker.vertex_positions", 4): ("spatial", "material"),
     ("area_shadow", "blocker.vertex_positions", 2): ("spatial",),
     ("area_shadow", "camera.to_world", 4): ("spatial", "material"),
