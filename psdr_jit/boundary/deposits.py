@@ -5,7 +5,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..paths.surface_at import surface_at
 from ..plan.job import Job
 
 
@@ -32,5 +31,4 @@ def carried_off(
     g = deposit(a, n, -following.d)
     if job.form == "spatial":
         return g
-    si = surface_at(job.surfaces, found, following, mi.RayFlags.Minimal)
-    return dr.select(job.close_by.has(si, -following.d, active & found.is_valid()), g, a)
+    return dr.select(job.close_by.met_by(following, found, -following.d, active), g, a)

@@ -147,8 +147,8 @@ class Place:
     """A vertex among those of its path."""
 
     first: mi.Bool
-    slides: mi.Bool  # in the mixed form: the vertex slides along the ray that reaches it ...
-    slides_next: mi.Bool  # ... and so does the one after it
+    slides: mi.Bool  # in the material and the mixed form: it slides along the ray that reaches it
+    slides_next: mi.Bool | None  # so does the one after it; None: in no lane
 
 
 @dataclass

@@ -122,7 +122,7 @@ def _turned(job: Job, found: _Found, lane: mi.UInt32, limits: PathLimits) -> Tur
     if job.facts.geometry_moves:
         job.call.counters.grazing.count(~sound)
     if job.close_by is not None:
-        records.note_close_by(job.close_by, job.surfaces)
+        records.note_close_by(job.close_by)
     per_px = None
     if job.film_flow is not None:
         per_px = ray_per_pixel(job.sensor, path.p, RayNumbers(path.aperture, mi.Float(0), mi.Float(0.5)))

@@ -5,6 +5,22 @@ Directions then change with their end points, and so does the measure:
     w_k = f(ω_{k+1}) · G(x_k, x_{k+1}) |dA_{k+1}/dA_0| / p
 
 [Zhang et al. 2020, Eq. 6]. The first vertex follows the camera ray and slides as in the spatial flow.
+
+In the *mixed* form so do those after a vertex with another surface close by, which records know of
+(`PathRecords.note_close_by`). With s_k = 1 where the vertex after x_k slides along its ray (`spatial.py`), and 0 where
+it stays where it is, the direction in which x_k is left moves by
+
+    ω̇_k = (1 − s_k) · m(ω_k),        m = (v_{k+1} − u_k), at right angles to ω_k, over |x_{k+1} − x_k|
+
+s_k is a function of x_k alone, and of the side of the surface on which ω_k lies. The divergence of the flow has the
+derivatives ∂ω̇_k/∂ω_k only, so that none of s_k occurs in it; nor is the step of s_k between two places x_k a boundary,
+as ω̇_k does not cross it, nor that between both sides, where f·cosθ is 0. Hence the terms of the interior are those of
+the one form or of the other, vertex by vertex, and boundary segments at the receiver x_k as well (`boundary/indirect`).
+Motion is carried from x_k on to a vertex that slides, and ends at one that does not.
+
+In corners and contacts the material form has kernels 1/|x_{k+1} − x_k|, of which neither variance nor, where two
+surfaces move against each other, the integral itself is finite; elsewhere the spatial one slides over textures and at
+slants, by 1/cosθ. The two weaknesses are in different places (`paths/close_by.py`).
 """
 
 from __future__ import annotations
@@ -33,7 +49,7 @@ class MaterialFlow(Flow):
     def terms(
         self, vertex: Vertex, following: Arrival, ray: mi.Ray3f, at: Place, moves: Displacements
     ) -> VertexTerms:
-        si = _surface(vertex, ray, self._slides(at), moves)
+        si = _surface(vertex, ray, at.slides, moves)
         bsdf = si.bsdf()
         L = dr.select(at.first, vertex.weight_emission * si.emitter(self.scene).eval(si, at.first), 0)
         L += next_event(si, bsdf, vertex.nee, self.traits, moves)
@@ -46,23 +62,10 @@ class MaterialFlow(Flow):
         if self.traits.smooth_lights is not None:
             value *= self.traits.smooth_lights.of_ray(si, bsdf, behind, ω, following.weight_emission, emits)
         L += dr.select(emits, w * value * following.weight_emission, 0)
-        return VertexTerms(si.p, following.hit.d, L, self._onward(w, si, bsdf, vertex, following, at))
-
-    def _slides(self, at: Place) -> mi.Bool:
-        """Does the vertex slide along its ray?"""
-        return at.first
-
-    def _onward(
-        self,
-        w: mi.Spectrum,
-        si: mi.SurfaceInteraction3f,
-        bsdf: mi.BSDFPtr,
-        vertex: Vertex,
-        following: Arrival,
-        at: Place,
-    ) -> mi.Spectrum:
-        """Factor on what arrives from the next vertex; `w`: if that stays where it is."""
-        return w
+        if at.slides_next is not None:
+            along = self.traits.scattered(si, bsdf, following.hit.d, goes_on) * vertex.onward.inv_pdf()
+            w = dr.select(at.slides_next, along, w)
+        return VertexTerms(si.p, following.hit.d, L, w)
 
 
 def _surface(vertex: Vertex, ray: mi.Ray3f, slides: mi.Bool, moves: Displacements) -> mi.SurfaceInteraction3f:

@@ -35,14 +35,14 @@ from .along_walk import MaterialTangents, RadianceTangents
 from .camera_pass import CameraPass, camera_passes
 from .flow import Flow, SceneTraits
 from .material import MaterialFlow
-from .mixed import MixedFlow
 from .resting import RestingFlow
 from .spatial import SpatialFlow
 from .sphere_rims import RimPass, SphereRims, with_rims
 from .sweeps import backward_sweep, forward_sweep
 
-#: What vertices do from the second on, by form: slide along their rays, or stay on their material.
-FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow, "mixed": MixedFlow}
+#: What vertices do from the second on, by form: slide along their rays, or stay on their material; in the mixed one,
+#: those of which records do not say that they slide.
+FLOWS = {"spatial": SpatialFlow, "material": MaterialFlow, "mixed": MaterialFlow}
 
 #: Share of the paths that had a derivative when they were looked for last, by an integrator.
 TOUCHED_SHARE: Slot[float] = Slot(float)
@@ -133,7 +133,7 @@ def _record(job: Job, p: CameraPass | RimPass) -> tuple[PathRecords, mi.UInt32]:
     if facts.geometry_moves:
         job.call.counters.grazing.count(records.cut())
     if job.close_by is not None:
-        records.note_close_by(job.close_by, job.surfaces)
+        records.note_close_by(job.close_by)
     return records, lane
 
 

@@ -1,6 +1,6 @@
 """Which points of surfaces have another surface close by: corners, contacts, narrow gaps.
 
-The *mixed* form of the path integral chooses by it what the vertex after x does, see `interior/mixed.py`. That is
+The *mixed* form of the path integral chooses by it what the vertex after x does, see `interior/material.py`. That is
 unbiased for any function of x and of the side on which the path goes on, as long as all terms use the same one. Here
 a few short rays tell, most of them low above the surface, where corners are: directions and lengths depend on x alone.
 """
@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.sensor_frame import SensorFrame, view_width
+from ..scene.surfaces import Surfaces
+from .surface_at import surface_at
 
 #: Length of the rays, relative to the width of what the film shows at the distance of x.
 REACH = 3e-3
@@ -30,6 +32,14 @@ class CloseBy:
 
     scene: mi.Scene
     frame: SensorFrame
+    surfaces: Surfaces | None = None  # that Mitsuba does not evaluate
+
+    def met_by(
+        self, ray: mi.Ray3f, pi: mi.PreliminaryIntersection3f, ω: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Bool:
+        """`has` of the surface that `ray` meets at `pi`; not where it escapes."""
+        si = surface_at(self.surfaces, pi, ray, mi.RayFlags.Minimal, active)
+        return self.has(si, ω, active & si.is_valid())
 
     @dr.syntax
     def has(self, si: mi.SurfaceInteraction3f, ω: mi.Vector3f, active: mi.Bool) -> mi.Bool:

@@ -7,12 +7,10 @@ import mitsuba as mi
 
 from ..core.records import Arrival, Hit, Place, Vertex
 from ..core.varying import varying
-from ..scene.surfaces import Surfaces
 from .close_by import CloseBy
 from .edge_on import GRAZING, met_edge_on
 from .rays import shadow_hit
 from .sink import NoSink, Scatter, Sink
-from .surface_at import surface_at
 
 
 class PathRecords(Sink):
@@ -70,25 +68,24 @@ class PathRecords(Sink):
         """Vertex `k` of every lane; zero where inactive."""
         return dr.gather(Vertex, self.vertices, k * self.stride + self.lane, active)
 
-    def note_close_by(self, close_by: CloseBy, surfaces: Surfaces | None) -> None:
+    def note_close_by(self, close_by: CloseBy) -> None:
         """Ask of every vertex whether another surface is close by, where the path goes on."""
         entry = dr.arange(mi.UInt32, self.lanes * self.depth)
         k, count = entry // self.stride, dr.gather(mi.UInt32, self.count, entry % self.stride)
         goes_on = (k < count) & self.vertices.onward.goes_on()
         onward = dr.gather(mi.Vector3f, self.vertices.hit.d, entry + self.stride, goes_on)
         hit = self.vertices.hit
-        si = surface_at(surfaces, hit.intersection(), mi.Ray3f(hit.o, hit.d), mi.RayFlags.Minimal, goes_on)
-        self.close_by = close_by.has(si, onward, goes_on)
+        self.close_by = close_by.met_by(mi.Ray3f(hit.o, hit.d), hit.intersection(), onward, goes_on)
         dr.eval(self.close_by)
 
     def place(self, k: mi.UInt32, active: mi.Bool) -> Place:
         """Vertex `k` of every lane among those of its path."""
         first = k == 0
         if self.close_by is None:
-            return Place(first, mi.Bool(False), mi.Bool(False))
+            return Place(first, first, None)
         index = k * self.stride + self.lane
         before = dr.gather(mi.Bool, self.close_by, index - self.stride, active & ~first)
-        return Place(first, before, dr.gather(mi.Bool, self.close_by, index, active))
+        return Place(first, first | before, dr.gather(mi.Bool, self.close_by, index, active))
 
     def arrival(self, k: mi.UInt32, active: mi.Bool) -> Arrival:
         """Only how vertex `k` was reached, and what its emission counts."""

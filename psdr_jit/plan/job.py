@@ -153,7 +153,7 @@ class Job:
     @property
     def close_by(self) -> CloseBy | None:
         """Tells behind which vertices paths slide, in the mixed form; None in the others."""
-        return CloseBy(self.scene, self.frame) if self.form == "mixed" else None
+        return CloseBy(self.scene, self.frame, self.surfaces) if self.form == "mixed" else None
 
     @property
     def orbits(self) -> Orbits | None:
